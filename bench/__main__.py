@@ -1,7 +1,5 @@
 """Run a benchmark by its name: python -m bench NAME [ARGUMENTS], which `make bench-NAME` calls."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 

@@ -29,9 +29,8 @@ _BAGS = {"eight": Path("bags/eight_five_robots"), "w2": Path("bags/eight_five_ro
 
 def halves(recording: Recording) -> tuple[Recording, Recording]:
     """The first and the second half."""
-    first_ns, last_ns = recording.range_ns
-    middle_ns = (first_ns + last_ns) // 2
-    return recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)
+    first, second = recording.halves_ns
+    return recording.between(*first), recording.between(*second)
 
 
 def errors(recording: Recording, swarm: Swarm) -> dict[str, float]:

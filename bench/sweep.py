@@ -8,8 +8,6 @@ byte for byte: that of one worker, of two, of a sweep whose processes were kille
 of a Ray cluster of two local nodes, and of Dask. `evo_ape` judges what `replay --tum` has written.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -20,8 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 from zipfile import ZipFile
 
 from ray.cluster_utils import Cluster
@@ -29,9 +28,6 @@ from ray.cluster_utils import Cluster
 from bench.shared.bags import copy_part
 from bench.shared.common import Cell, table, write_figures
 from swarm_loc_estimator.offline.replay import replay
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 PROGRAM = [

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from swarm_loc_estimator.common.parameters import number_specs
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -97,6 +99,6 @@ def _prepare_docstring(
     if what in {"attribute", "data", "property"}:
         lines.insert(0, r"\ ")  # shown as nothing; a colon behind it names no type
     if isinstance(obj, type) and is_dataclass(obj) and "Attributes:" not in lines:
-        specs = [(one.name, one.metadata["spec"]) for one in fields(obj) if "spec" in one.metadata]
+        specs = number_specs(obj).items()
         numbers = [f"    {name}: {spec.doc}, in {spec.range_text}." for name, spec in specs]
         lines += ["Attributes:", *numbers, ""] if numbers else []

@@ -1,7 +1,5 @@
 """Robots that find themselves among anonymous ones in images from above: success rates, times, detections."""
 
-from __future__ import annotations
-
 from bench.aerial import cases, chains, detector, rendered
 from bench.aerial.chains import SWARMS, Results
 from bench.shared.common import Cell, options_of, plot_curves, table, write_figures

@@ -5,8 +5,6 @@ camera and control points. Those without a file of their own with the truth show
 places.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from dataclasses import replace

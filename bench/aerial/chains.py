@@ -9,8 +9,6 @@ scale's error (2 %) are not printed either; with them the method of the paper ha
 rate (`304ddb9b:bench/aerial/driving.py`).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator
@@ -21,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Scale
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint
 
 ComplexArray = NDArray[np.complex128]

@@ -4,8 +4,6 @@ A floor plan is painted with discs, texture, lines and things that are no robots
 over it; a camera of any tilt and lens looks at it, pixel by pixel as means of several samples.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The robots drive an eight; nothing tells them apart, and the estimator does not 
 `simulate --aerial` starts runs as child processes.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The Cramer-Rao bound of a relative pose from brightness matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr

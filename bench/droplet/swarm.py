@@ -10,8 +10,6 @@ without ground truth (`calibrate_ir`) in another minute of the same robots. Erro
 time on when the swarm has found itself.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

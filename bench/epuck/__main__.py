@@ -13,21 +13,19 @@ rendered pictures, the marker detector, emulated firmware, drivers, the whole gr
 At the end the marker detector sees the same pictures as others.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.epuck import rendered
 from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
 from bench.vision import report as vision_report
@@ -35,9 +33,6 @@ from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
-
-if TYPE_CHECKING:
-    from bench.scenarios.lived_run import SimulatedRun
 
 SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8

@@ -4,8 +4,6 @@ A block of robots drives a small eight in the e-puck paper's arena, all in step.
 landmark, as in a swarm so dense that neighbours stand in every line of sight.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

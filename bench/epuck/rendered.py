@@ -3,8 +3,6 @@
 The nodes of `simulate` run as child processes. Part of `make bench-epuck`.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 

@@ -9,8 +9,6 @@ pause until the counts of drivers and estimator no longer change, answer for a w
 "Discovery" is the time from the last driver's first answer to the first message of the last robot.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -8,8 +8,6 @@ of each robot, once with topics that all share (`shared_topics`). The age of a p
 reception; the data behind it is older.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Record a live graph of simulated robots on the eight: their messages and true poses."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

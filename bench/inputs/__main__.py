@@ -6,8 +6,6 @@ A part is a module with a function `measure(seeds, say)`, which returns figures 
     make bench-inputs ARGS="--parts uwb mocap --seeds 2"
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from bench.inputs import families, imu, lidar_map, mocap, no_map, overhead, uwb

@@ -1,28 +1,31 @@
 """Families of markers: ids read at 30 px, and ids read where there are none, compared with OpenCV."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.aerial.cases import FOLDER, gray_picture
 from bench.shared.common import ProgressLine
 from bench.vision.comparison import match
 from bench.vision.negatives import black_square, random_family
 from bench.vision.peers import Found, Peer, as_found, opencv_name, stock
-from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, facing, project, random_scene, render
+from bench.vision.scenes import (
+    CAMERA,
+    HEIGHT,
+    WIDTH,
+    Gray,
+    Look,
+    Truth,
+    facing,
+    project,
+    random_scene,
+    render,
+)
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import CODE_OTHER, Family, families
 from swarm_loc_vision.markers.pose import square
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from bench.vision.scenes import Gray
 
 SIDE_PX = 30.0
 _OWN_MARKERS = {"opencv": "aruco_6x6", "apriltag": "apriltag_36h11", "charuco": "aruco_4x4"}

@@ -5,8 +5,6 @@ of the other benchmarks. All cameras are covered for the second minute. Twists a
 the usual slip and all sightings.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -7,8 +7,6 @@ beams ends at people who are not in the map and walk around. "wrong_start" is of
 the truth, so they contain those of the map.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

@@ -1,9 +1,7 @@
 """Motion capture with drop-outs and delays, through the bridge and the estimator."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +12,10 @@ from swarm_loc_drivers.sim.differential_drive import Drive
 from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_estimator import FixRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
 ROBOTS = 5
 DURATION_S = 60.0
@@ -70,12 +64,11 @@ def _drive(rng: np.random.Generator) -> LivedRun:
     start = rng.uniform([-1.0, -1.0, -np.pi], [1.0, 1.0, np.pi], (ROBOTS, 3))
     model = swarm.robots[0].odometry
     wheels, rate_hz = Drive(model.wheel_separation, model.wheel_noise), SECOND_NS / STEP_NS
-    return LivedRun(
-        swarm,
-        *record_drive(
-            rng, start, control, wheels, step_ns=STEP_NS, duration_s=DURATION_S, odometry_rate_hz=rate_hz
-        ),
+    truth, odometry = record_drive(
+        rng, start, control, wheels, step_ns=STEP_NS, duration_s=DURATION_S, odometry_rate_hz=rate_hz
     )
+    odometry["arrival_ns"] = odometry["stamp_ns"]  # fixes alone are late
+    return LivedRun(swarm, truth, odometry[np.argsort(odometry["stamp_ns"], kind="stable")])
 
 
 def _is_lost(at_ns: IntArray, rng: np.random.Generator) -> BoolArray:

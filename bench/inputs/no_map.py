@@ -5,8 +5,6 @@ only; errors are those after a rigid fit at each instant, compared with a run in
 the second part, robots of two groups do not see each other for half a minute, and landmarks come after 40 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 

@@ -11,8 +11,6 @@ it never is, "accused" the number of innocent sources that are named. "others" i
 the fault does not concern over that of the run without it, while it lasts, and "after" in the 30 s after it.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Faults injected into simulated runs, and what all scenarios share."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ In the live graph five emulated e-pucks drive the eight in a rendered world, wit
 starts. An estimator that starts late, while PushBots map, is replayed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Those of other sensors than odometry and cameras on robots are in `sensors.py`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache

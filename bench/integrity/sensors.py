@@ -4,8 +4,6 @@ Each replaces readings of a time by wrong ones, and says whom a contradiction ma
 five e-pucks carry lying tags; detections come without images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace

@@ -5,26 +5,20 @@ its camera is turned, and the landmarks stand beside where the survey has them. 
 Errors of the second half of a run count, of the poses told as tracked.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.peers.scaling import second_half
+from bench.scenarios.lived_run import Records, SimulatedRun
 from bench.shared.common import flat, options_of, plot_by_size, table, write_figures
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.shared.simulated_run import run_core, ticks
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from bench.scenarios.lived_run import Records, SimulatedRun
-    from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)
 ROBOT_SECONDS = 12_000.0  # A run of N robots is N-th of this long, and 40 s at most

@@ -6,14 +6,12 @@ decoded to arrays of numbers: stamps and poses, or ids, positions and covariance
 bytes, which rosbags' type store turns into objects. All readers of a recording are measured in one run.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
@@ -22,16 +20,12 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from bench.mrclam.sets import import_set
 from bench.shared.bags import copy_part
 from bench.shared.common import DEMO_BAG, OUT, flat, new_plot, save_plot, table, write_figures
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_odometry, yaw_of
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from swarm_loc_estimator.common.arrays import FloatArray
 
 MRCLAM_S = 300.0  # How much of a set is read [s]; costs per message do not change with the length
 REPEATS = 3

@@ -8,8 +8,6 @@ second half of such a run count, of the poses with status TRACKED. At the end so
 live graph in real time (`make bench-large_swarms`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

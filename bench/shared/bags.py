@@ -1,7 +1,5 @@
 """Bags for benchmarks and tests: their parts, ground truth received live, messages of many robots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,25 +1,20 @@
 """What all benchmarks share: the folder of results, tables, figures and the style of plots."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
-
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 OUT = Path(__file__).resolve().parents[2] / "out"  # Folder of results
 DEMO_BAG = OUT.parent / "bags" / "eight_five_robots"

@@ -5,8 +5,6 @@ the landmarks that stand around the grid, one pitch outside. Odometry comes at 2
 each robot at its own phase.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum

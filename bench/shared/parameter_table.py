@@ -1,7 +1,5 @@
 """Parameters as the table of Markdown that the page of a node has; tests compare the two."""
 
-from __future__ import annotations
-
 from swarm_loc_estimator.common.parameters import Value, parameter_specs
 
 

@@ -1,33 +1,25 @@
 """A simulated run through the estimator, and its errors, the same for all benchmarks."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.scenarios.bags import as_detections
-from bench.scenarios.lived_run import SimulatedRun, in_order_of_arrival
+from bench.scenarios.lived_run import LivedRun, SimulatedRun, in_order_of_arrival
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.timeline.estimator import Estimator
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from bench.scenarios.lived_run import LivedRun
-    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-    from swarm_loc_estimator.swarm.swarm import Swarm
-    from swarm_loc_estimator.timeline.estimator import Estimate
-    from swarm_loc_estimator.timeline.settings import Settings
-
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 _TICK_NS = 100_000_000
 _COLUMNS = ("robot", "stamp_ns", "arrival_ns")

@@ -1,7 +1,5 @@
 """What the tests of the page share: a browser, a swarm that a test moves by hand, and its page."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

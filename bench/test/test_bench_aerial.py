@@ -1,7 +1,5 @@
 """The benchmark's worlds, rates and figures are sound."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A recording of real Droplets is held against the camera only while that saw a robot stand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

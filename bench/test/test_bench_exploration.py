@@ -1,7 +1,5 @@
 """PushBots in floor plans: motion and readings, a short exploration, and its bag through the mapper."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Faults are reported, and no robot is TRACKED with a wrong pose; with seeds that no figure comes from."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from pathlib import Path

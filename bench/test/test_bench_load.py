@@ -1,7 +1,5 @@
 """Live graphs whose clock jumps or stops: nothing is lost unsaid, nothing misleads, poses come back."""
 
-from __future__ import annotations
-
 from bench.robustness.clocks import ON_CLOCK, ON_WALL, measure_breaks
 from bench.robustness.load import accounted, started
 from bench.robustness.source import SourceSettings

@@ -1,7 +1,5 @@
 """The MRCLAM benchmark finds sets, hides what a run must not see, and carries models over by robot name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Benchmarks can be run by their names; readers and sweeps find the same before their speed is compared."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

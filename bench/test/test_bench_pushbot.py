@@ -1,7 +1,5 @@
 """The measures of maps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

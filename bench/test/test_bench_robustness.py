@@ -1,7 +1,5 @@
 """Drivers of all protocols under corrupted bytes: no thread ends, no error is hidden, no nonsense is life."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

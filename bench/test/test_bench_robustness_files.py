@@ -1,7 +1,5 @@
 """Outputs on full disks, and with things in the way: nothing is cut, and careless commands are seen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page in a real Chromium: what it shows, what it orders, and what it must not do."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Worlds of benchmarks: who sees whom in large and dense swarms, and what is scored of them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

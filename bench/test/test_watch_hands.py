@@ -1,7 +1,5 @@
 """Hands on the page: fingers that move and pinch it, keys that drive a robot, and who is let in to do so."""
 
-from __future__ import annotations
-
 import queue
 import socket
 from collections.abc import Iterator, Mapping

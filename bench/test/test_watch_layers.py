@@ -1,7 +1,5 @@
 """Each layer of the page is painted, goes with its switch, and comes back, by the pixels of the screen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

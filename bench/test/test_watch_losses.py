@@ -1,7 +1,5 @@
 """The page says why a robot is lost, one test a reason: live what /diagnostics says, and in a recording."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Measure the detector alone: `make bench-vision`."""
 
-from __future__ import annotations
-
 from bench.shared.common import options_of, table, write_figures
 from bench.vision.boards import PHOTOS, measure_covariances
 from bench.vision.report import measure, plot

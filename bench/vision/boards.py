@@ -6,8 +6,6 @@ with which the pose of each of its markers is compared. The better of the two so
 Rendered images are also changed as cameras change theirs: by a tone curve, sharpening, scaling and JPEG.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixed cameras over an arena whose robots carry markers that lie flat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

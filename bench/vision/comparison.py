@@ -1,7 +1,5 @@
 """Detectors on the same images: recall, corners, poses, false ids and time."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """False-positive rates: squares that are no markers, and how many of them are read as an id."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Marker detectors behind one interface: an image in, ids and corners out, in one convention."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 All ids of the BCH family are read in every rotation and with both borders, and their cost is measured.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ A pixel's value is the mean over a grid of points in its square and over instant
 are where the geometry puts them, to 0.01 px. Then come the blur of the optics, light and noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +14,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.sampling import homographies
 from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.lines import homographies
 from swarm_loc_vision.markers.pose import square
 
 Gray = NDArray[np.uint8]

@@ -9,8 +9,6 @@ stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The estimator's l
 are played.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Drive a real Chromium without a screen: open the page, wait for what it paints, note what goes wrong."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Poses twenty times a second, sightings of neighbours five times, diagnostics onc
 cost a small part of a core, so that a page can be measured without an estimator beside it.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

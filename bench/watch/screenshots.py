@@ -4,8 +4,6 @@ Five e-pucks and twenty Droplets as the bags of this repository hold them, three
 each replayed by the estimator; shown in Chromium as by `report.html`.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A swarm that a test moves by hand, served to a page."""
 
-from __future__ import annotations
-
 import queue
 import time
 from collections.abc import Sequence

@@ -60,9 +60,9 @@ def size_of(swarm: Swarm, settings: Settings) -> Size:
 
 
 def precompile(size: Size, infrared: bool) -> None:
-    """Run small estimators through all that a swarm of some size does; takes a second once compiled.
+    """Run small estimators through all that a swarm of some size does, and with infrared light as well.
 
-    With infrared light, by which its robots measure each other, it takes as long again.
+    It takes a second once compiled.
     """
     compiled = partial(precompile, size, infrared)
     if not is_precompiled(compiled):
@@ -137,11 +137,7 @@ def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
                     estimator.convert(batch)
         estimator.tick(now_ns)
         estimator.contradictions(now_ns)
-    _call_rare(swarm)
-
-
-def _call_rare(swarm: Swarm) -> None:
-    """What is called once something contradicts, or once many infrared exchanges are fused together."""
+    # what is called once something contradicts
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed), pairs=2)
     is_kidnapped(state.sources, 0)
 
@@ -153,7 +149,6 @@ def _light() -> FloatArray:
 
 
 def _odometry(stamp_ns: int, x: float, yaw: float) -> bytes:
-    """One message."""
     pose, unknown = np.array([[x, 0.0, yaw]]), np.zeros((6, 6))
     return encode_odometry("", "", np.array([stamp_ns]), pose, np.zeros((1, 3)), unknown, unknown)[0]
 

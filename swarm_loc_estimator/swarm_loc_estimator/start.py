@@ -43,12 +43,8 @@ def swarm_loc() -> int:
     for title, needs_ros in (("Without ROS 2", False), ("With ROS 2", True)):
         print(f"\n{title}:")
         for name, program in programs.items():
-            if program.needs_ros == needs_ros:
-                print(f"  {name:16} {_summary(program.module)}")
+            if program.needs_ros == needs_ros:  # with the first line of its docstring; nothing is imported
+                path = Path(__file__).parent.joinpath(*program.module.split(".")[1:]).with_suffix(".py")
+                summary = path.read_text(encoding="utf-8").partition("\n")[0].strip('"')
+                print(f"  {name:16} {summary}")
     return 0
-
-
-def _summary(module: str) -> str:
-    """First line of a module's docstring, without importing it."""
-    path = Path(__file__).parent.joinpath(*module.split(".")[1:]).with_suffix(".py")
-    return path.read_text(encoding="utf-8").partition("\n")[0].strip('"')

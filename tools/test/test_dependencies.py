@@ -1,7 +1,5 @@
 """Each package names in its package.xml what it imports; vision and drivers need little of the estimator."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

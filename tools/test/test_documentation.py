@@ -1,7 +1,5 @@
 """What the Markdown files name exists: paths, links, executables, targets of make, bags."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from configparser import ConfigParser

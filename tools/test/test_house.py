@@ -1,7 +1,5 @@
 """The rules of the layout, see CONTRIBUTING.md: sizes, imports, names, words and documentation."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

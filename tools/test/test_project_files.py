@@ -1,7 +1,5 @@
 """The project's own files parse and name what exists: workflow, hooks, citation, papers, container."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The documentation site has all pages of the repository, all names of the API, and all messages."""
 
-from __future__ import annotations
-
 import re
 import runpy
 

@@ -5,8 +5,6 @@ These may need it: modules named `*_node.py` or `*_nodes.py`; in the estimator `
 what publishes for nodes, named `*_diagnostics.py`, `*_messages.py` or `*_output.py`.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What set-up understands of other programs' files and words."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`./run` finds executables as `ros2 run` does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Clones of one user share built packages of messages, by what these are built from."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

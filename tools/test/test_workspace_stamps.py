@@ -1,7 +1,5 @@
 """A step's stamp says done only when it is."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path

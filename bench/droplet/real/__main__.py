@@ -10,8 +10,6 @@ apart with no other robot within 44 mm of the line between them. Headings of the
 fit found of each robot's fiducial. At the end whole recordings go through the estimator, see `graph`.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

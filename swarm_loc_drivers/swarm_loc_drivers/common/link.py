@@ -21,18 +21,10 @@ class Link(Protocol):
     """An open link."""
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes received, as soon as there are any; empty after the timeout.
-
-        Raises:
-            LinkError: The link is broken.
-        """
+        """Bytes received, as soon as there are any; empty after the timeout; a LinkError if it is broken."""
 
     def write(self, data: bytes) -> None:
-        """Send all bytes.
-
-        Raises:
-            LinkError: The link is broken, or a write timed out.
-        """
+        """Send all bytes; a LinkError if the link is broken, or a write timed out."""
 
     def close(self) -> None:
         """Close the link."""
@@ -73,12 +65,9 @@ def parse_address(text: str, default_port: int) -> Address:
 
 
 def open_link(address: Address, baud_rate: int, timeout_s: float) -> Link:
-    """Open a serial port with a baud rate [bit/s], or a TCP connection.
+    """Open a serial port with a baud rate [bit/s], or a TCP connection; a LinkError if that fails.
 
     A write has a timeout [s]; connecting by TCP may take twice as long.
-
-    Raises:
-        LinkError: It cannot be opened.
     """
     if address.device:
         return SerialLink(address.device, baud_rate, timeout_s)
@@ -90,13 +79,7 @@ _BROKEN = (OSError, TypeError, termios.error)
 
 
 class SerialLink:
-    """An open serial port with a baud rate [bit/s], 8N1, locked by this process.
-
-    A write that takes longer than its timeout breaks the link.
-
-    Raises:
-        LinkError: It cannot be opened.
-    """
+    """An open serial port, 8N1, locked by this process; a write longer than its timeout breaks the link."""
 
     def __init__(self, device: str, baud_rate: int, write_timeout_s: float) -> None:
         self._device = device
@@ -131,11 +114,7 @@ def _reason(error: Exception) -> str:
 
 
 class TcpLink:
-    """A TCP connection; the robot is the server. Connecting, and a write, have a timeout [s].
-
-    Raises:
-        LinkError: It cannot be opened.
-    """
+    """A TCP connection; the robot is the server. Connecting, and a write, have a timeout [s]."""
 
     def __init__(self, host: str, port: int, timeout_s: float) -> None:
         self._name = f"tcp://{host}:{port}"

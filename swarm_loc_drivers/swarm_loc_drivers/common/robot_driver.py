@@ -35,10 +35,9 @@ class DriverParameters:
 
 
 class VelocityCommand:
-    """Holds the newest velocity; zero after a timeout [s].
+    """Holds the newest velocity; zero after a timeout [s]. Counts `bad_cmd_vel` and `stale_cmd_vel`.
 
-    The clock [ns] may be simulated, and 0 means no time; `steady_s` is real time. Counts `bad_cmd_vel` and
-    `stale_cmd_vel`.
+    The clock [ns] may be simulated, and 0 means no time; `steady_s` is real time.
     """
 
     def __init__(
@@ -114,12 +113,9 @@ class TalkSession(ABC):
         """Talk to the robot: append to `_output`, yield, and read `_received`."""
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """Continue the conversation with the bytes received since the last step; returns bytes to send.
+        """Continue with the bytes received since the last step; returns bytes to send, or a SessionError.
 
         The time [ns] may be simulated, stand still or jump back; 0 means no time. `steady_s` is real time.
-
-        Raises:
-            SessionError: The robot does not answer as it must.
         """
         self._received += data
         self._now_ns, self._steady_s = now_ns, steady_s

@@ -79,10 +79,8 @@ class MatrixValidator:
         self.robot: int | None = None  # Id of the robot at the cable
 
     def transmitter(self, said: Said, matrix: Matrix, asked: int | None) -> int | None:
-        """Id of the emitting robot; None if the matrix cannot be used.
-
-        Old formats lack it: then it is the robot that was asked to emit, if any.
-        """
+        """Id of the emitting robot; None if the matrix cannot be used."""
+        # old formats lack it: then it is the robot that was asked to emit, if any
         emitter = asked if matrix.emitter is None else matrix.emitter
         if not said.stamp_ns:
             reason = "no_clock"

@@ -53,14 +53,10 @@ class Gait(NamedTuple):
 
 
 def gait(direction: int, trims: Sequence[int], per_kilostep: int) -> Gait | None:
-    """The gait of a direction; None if no motor turns.
+    """The gait of a direction, by the calibrated path [mm] or turn [deg] of 1000 steps; None: no motor turns.
 
     In a step the motors of the direction run one after the other, 20 ticks each and a trim, and pause for 40.
-
-    Args:
-        direction: 0 to 7.
-        trims: Trims of the three motors [1/32 ticks], signed by the sense of rotation; 0: does not turn.
-        per_kilostep: Calibrated path [mm] or turn [deg] of 1000 steps.
+    Trims [1/32 ticks] are signed by the sense of rotation; 0: does not turn.
     """
     ticks = sum(_ON_TICKS + _OFF_TICKS + abs(trim) / _TRIMS_PER_TICK for trim in trims if trim)
     if not ticks:

@@ -58,10 +58,7 @@ class CommandedMotion:
         return self._move is not None and stamp_ns < self._move.end_ns
 
     def begin(self, stamp_ns: int, gait: Gait, steps: int, doubt: float = 0.0) -> None:
-        """Begin a motion of some steps; a robot that is already moving continues its current motion.
-
-        `doubt` is a variance in units of the motion: the probability that the command was lost.
-        """
+        """Begin a motion of some steps, unless the robot is moving; `doubt`: probability that it was lost."""
         self._advance(stamp_ns)
         if not self.moving(stamp_ns):
             self._settle()
@@ -144,5 +141,5 @@ class CommandedMotion:
     def _way(self, gait: Gait, steps: float) -> FloatArray:
         """Motion (3,) of steps in the odometry's frame; the turn is not wrapped."""
         cos, sin = math.cos(self._pose[2]), math.sin(self._pose[2])
-        step = [cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left, gait.turn]
-        return steps * np.array(step)
+        dx, dy = cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left
+        return steps * np.array([dx, dy, gait.turn])

@@ -235,7 +235,19 @@ class ConsoleParser:
         if line == "{":
             self._rows, self._rows_stamp_ns = [], self._stamp_ns
             return []
-        return [Said(self._stamp_ns, self._event(line))]
+        # a matrix in one line, another known line, or one without sense
+        event: Event = Noted(BROKEN if "{" in line or "}" in line else UNKNOWN, line)
+        if match := self._named.fullmatch(line):
+            emitter, receiver, *cells = match.groups()
+            event = Matrix(int(emitter, 16), int(receiver, 16), self._square(cells))
+        elif match := self._nameless.fullmatch(line):
+            event = Matrix(None, None, self._square(match.groups()))
+        else:
+            for pattern, make in _LINES:
+                if match := pattern.fullmatch(line):
+                    event = make(match)
+                    break
+        return [Said(self._stamp_ns, event)]
 
     def _line_of_matrix(self, line: str, rows: list[tuple[int, ...]]) -> list[Said]:
         """Parse a line after an opening brace."""
@@ -249,18 +261,6 @@ class ConsoleParser:
         if not missing and self._last.fullmatch(line):
             return [Said(self._rows_stamp_ns, Matrix(None, None, tuple(rows)))]
         return [Said(self._rows_stamp_ns, Noted(BROKEN, "{")), *self._line(line)]
-
-    def _event(self, line: str) -> Event:
-        """Parse a single line."""
-        if match := self._named.fullmatch(line):
-            emitter, receiver, *cells = match.groups()
-            return Matrix(int(emitter, 16), int(receiver, 16), self._square(cells))
-        if match := self._nameless.fullmatch(line):
-            return Matrix(None, None, self._square(match.groups()))
-        for pattern, make in _LINES:
-            if match := pattern.fullmatch(line):
-                return make(match)
-        return Noted(BROKEN if "{" in line or "}" in line else UNKNOWN, line)
 
     def _square(self, cells: tuple[str, ...] | list[str]) -> tuple[tuple[int, ...], ...]:
         """Arrange cells in rows."""

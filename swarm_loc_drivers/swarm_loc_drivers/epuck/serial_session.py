@@ -199,15 +199,13 @@ class SerialSession(TalkSession):
         return self._wanted_speeds() if self.connected and not self.ending else (0, 0)
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
-        """Read counters and proximity; the stamp is the middle between request and reply.
-
-        A reply that is far later than the one before is not used: this process was stopped meanwhile.
-        """
+        """Read counters and proximity; the stamp is the middle between request and reply."""
         asked_ns = self._now_ns
         body = yield from self._request(readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
         way_ns = max(0, self._now_ns - asked_ns) // 2
+        # a reply that is far later than the one before is not used: this process was stopped meanwhile
         is_late = way_ns > (most_ns := 2 * self._way_ns + _JITTER_NS)
         self._way_ns = min(way_ns, most_ns)
         left, right, proximity = decode_readings(body)
@@ -280,10 +278,7 @@ class SerialSession(TalkSession):
             raise SessionError(f"the robot's camera is set to {taken} though {wanted} was asked for")
 
     def _resync(self) -> Talk[None]:
-        """Bring the robot back to idle, whatever bytes were lost, and send the current speeds.
-
-        Each attempt sends the speeds of its moment, since the robot may hear and not be heard.
-        """
+        """Bring the robot back to idle; each attempt sends the speeds of its moment: it may be heard."""
         for _ in range(_TRIES):
             self._counts["resyncs"] += 1
             self._sent = self._speeds()

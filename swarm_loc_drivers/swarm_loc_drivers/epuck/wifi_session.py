@@ -149,8 +149,9 @@ class StreamParser:
         if not self._synced and self._buffer and self._buffer[0] != SENSORS_ID:
             return _BAD
         length = self._length_at(0)
-        is_image = self._image_begins_at(0)
-        if length > 0 and not self._image_begins_at(length):
+        # the end of an image would give no further evidence
+        is_image, is_before_image = (self._buffer[at : at + 1] == bytes([IMAGE_ID]) for at in (0, length))
+        if length > 0 and not is_before_image:
             following = self._length_at(length)
             if following == _BAD or (following == _UNDECIDED and (is_image or not self._synced)):
                 length = following
@@ -172,10 +173,6 @@ class StreamParser:
             return _BAD
         return end - begin
 
-    def _image_begins_at(self, begin: int) -> bool:
-        """Whether the byte is the id of an image; its end would give no further evidence."""
-        return begin < len(self._buffer) and self._buffer[begin] == IMAGE_ID
-
     def _holds_sensor_values(self) -> bool:
         """Whether an image contains two consecutive messages of sensor values: then part of it was lost."""
         size = 1 + _SIZES[SENSORS_ID]
@@ -183,10 +180,8 @@ class StreamParser:
         candidate = self._buffer.find(SENSORS_ID, max(1, self._searched))
         while 0 <= candidate <= last:
             after = candidate + size
-            if (
-                self._buffer[after] == SENSORS_ID
-                and min(self._length_at(candidate), self._length_at(after)) > 0
-            ):
+            follows = self._buffer[after] == SENSORS_ID
+            if follows and min(self._length_at(candidate), self._length_at(after)) > 0:
                 return True
             candidate = self._buffer.find(SENSORS_ID, candidate + 1)
         self._searched = max(0, last)
@@ -214,11 +209,6 @@ class _Arrival(NamedTuple):
     stamp_ns: int
     gap_ns: float = math.inf
     is_late: bool = False
-
-    def next(self, stamp_ns: int) -> _Arrival:
-        """The arrival of the next message."""
-        gap_ns = stamp_ns - self.stamp_ns
-        return _Arrival(stamp_ns, gap_ns, gap_ns > 2.0 * self.gap_ns + _JITTER_NS)
 
 
 class WifiSession:
@@ -259,9 +249,13 @@ class WifiSession:
         # of each kind the newest message that has a reliable stamp: the arrival of the one before
         for message in messages:
             before = self._arrivals.get(message.id)
-            arrival = before.next(message.stamp_ns) if before else _Arrival(message.stamp_ns)
-            if before is not None and not before.is_late and not arrival.is_late:
-                newest[message.id] = replace(message, stamp_ns=before.stamp_ns)
+            arrival = _Arrival(message.stamp_ns)
+            if before is not None:
+                gap_ns = message.stamp_ns - before.stamp_ns
+                is_late = gap_ns > 2.0 * before.gap_ns + _JITTER_NS
+                arrival = _Arrival(message.stamp_ns, gap_ns, is_late)
+                if not before.is_late and not is_late:
+                    newest[message.id] = replace(message, stamp_ns=before.stamp_ns)
             self._arrivals[message.id] = arrival
         is_heard = (NOTHING_ID if self.ending else SENSORS_ID) in newest
         # by real time and by the clock, which may stand still or jump back

@@ -29,7 +29,7 @@ from swarm_loc_drivers.common.robot_driver import (
     VelocityCommand,
 )
 from swarm_loc_drivers.pushbot import protocol
-from swarm_loc_drivers.pushbot.event_parser import EventPacket, EventPackets, EventParser, Parsed
+from swarm_loc_drivers.pushbot.event_parser import EventPacket, EventPackets, EventParser
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_drivers.pushbot.protocol import (
     MAX_TICK_RATE,
@@ -155,46 +155,42 @@ class PushbotSession(TalkSession):
         self.does_not_stop = False
         self._sent, self._sent_s = (0, 0), 0.0
         self._ticks: tuple[int, int] | None = None
-        self._ticks_s = 0.0  # of the newest reading
-        self._is_turning = False  # by the newest reading
+        self._ticks_s, self._is_turning = 0.0, False  # of the newest reading
         self._turned_s = 0.0  # of the last reading that changed, the last velocity or the first stop after it
         self._stood_s = 0.0  # when the robot last stood, was commanded to drive or was first stopped
 
     def _run(self) -> Talk[None]:
         yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
         if not self.ending:
-            generation = yield from self._set_up()
+            # identify the firmware
+            params = self._params
+            self._output += protocol.NO_ECHO
+            listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
+            generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
+            if generation is None:
+                raise SessionError("the board's firmware has no wheels: it is not built for PushBots")
+            # configure it
+            if timestamps := params.event_timestamps:
+                if timestamps not in generation.formats:
+                    raise SessionError(
+                        f"the firmware, of the {generation.name} generation, has no timestamps"
+                        f" '{timestamps}', only {', '.join(generation.formats)}"
+                    )
+                wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
+                answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
+                if int(answer[1]) != generation.formats[timestamps]:
+                    raise SessionError(
+                        f"the robot answers {answer[0]!r} to the choice of timestamps '{timestamps}'"
+                    )
+            # start the stream
+            self._output += protocol.lights(params.lights) + protocol.BRAKE + protocol.MOTORS_ON
+            self._output += protocol.stream_ticks(generation, _tick_period_ms(params))
+            self._output += protocol.EVENTS_ON if timestamps else b""
             yield from self._stream(generation)
         # turn everything off; the answer to the final query confirms all of it
         off = protocol.BRAKE + protocol.EVENTS_OFF + protocol.STOP_SENSORS + protocol.MOTORS_OFF
         dark = protocol.lights(protocol.Lights(0.0, 0.0))
         yield from self._answer(b"\n" + off + dark + protocol.QUERY_FORMAT, protocol.FORMAT, 0.0)
-
-    def _set_up(self) -> Talk[FirmwareGeneration]:
-        """Identify the firmware, configure it and start the stream."""
-        params = self._params
-        self._output += protocol.NO_ECHO
-        listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
-        generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
-        if generation is None:
-            raise SessionError("the board's firmware has no wheels: it is not built for PushBots")
-        if timestamps := params.event_timestamps:
-            if timestamps not in generation.formats:
-                raise SessionError(
-                    f"the firmware, of the {generation.name} generation, has no timestamps"
-                    f" '{timestamps}', only {', '.join(generation.formats)}"
-                )
-            wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
-            answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
-            if int(answer[1]) != generation.formats[timestamps]:
-                raise SessionError(
-                    f"the robot answers {answer[0]!r} to the choice of timestamps '{timestamps}'"
-                )
-        self._output += protocol.lights(params.lights) + protocol.BRAKE + protocol.MOTORS_ON
-        self._output += protocol.stream_ticks(generation, _tick_period_ms(params))
-        if params.event_timestamps:
-            self._output += protocol.EVENTS_ON
-        return generation
 
     def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[re.Match[bytes]]:
         timeout_s, who = self._params.reply_timeout_s + extra_s, f" {request.split()[0].decode()}"
@@ -218,10 +214,19 @@ class PushbotSession(TalkSession):
                 self._ticks_s = self._turned_s = self._stood_s = self._steady_s
             last_s = self._steady_s
             parsed = parser.feed(received)
-            stamps_ns = self._take_events(parsed, clock, packets)
+            # stamp and pack events, whose stamps time the lines between them
+            stamps_ns = np.full(len(parsed.x), self._now_ns)
+            if len(parsed.x):
+                if clock is not None:
+                    stamps_ns = clock.stamps(parsed.time_us, self._now_ns)
+                self._counts["events"] += len(parsed.x)
+                packets.add(parsed.x, parsed.y, parsed.polarity, stamps_ns, parsed.time_us)
+            packets.flush_late(self._now_ns)
+            self.found += packets.ready
+            packets.ready.clear()
             for before, line in parsed.lines:
                 if before and clock is not None:
-                    readings.pass_event(int(parsed.time_us[before - 1]), stamps_ns[before - 1])
+                    readings.pass_event(int(parsed.time_us[before - 1]), int(stamps_ns[before - 1]))
                 self._take_line(line, readings, generation)
             if self._steady_s > self._ticks_s + params.reply_timeout_s + params.tick_period_s:
                 raise SessionError("the robot has stopped sending wheel ticks")
@@ -234,22 +239,6 @@ class PushbotSession(TalkSession):
         parser = EventParser(timestamps, self._counts)
         clock = EventClock(parser.span_us) if timestamps != "none" else None
         return parser, clock, TickClock(_tick_period_ms(self._params))
-
-    def _take_events(self, parsed: Parsed, clock: EventClock | None, packets: EventPackets) -> list[int]:
-        """Stamp and pack events; their stamps [ns], which time the lines between them."""
-        count = len(parsed.x)
-        stamps: list[int] = []
-        if count:
-            stamps_ns = parsed.time_us * 0 + self._now_ns
-            if clock is not None:
-                stamps_ns = clock.stamps(parsed.time_us, self._now_ns)
-            self._counts["events"] += count
-            packets.add(parsed.x, parsed.y, parsed.polarity, stamps_ns, parsed.time_us)
-            stamps = stamps_ns.tolist() if parsed.lines else []
-        packets.flush_late(self._now_ns)
-        self.found += packets.ready
-        packets.ready.clear()
-        return stamps
 
     def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> None:
         """Take wheel ticks, or count another line."""

@@ -253,24 +253,19 @@ class EventPackets:
         for begin, end in zip([0, *cuts], [*cuts, len(x)], strict=True):
             for first in range(begin, end, MAX_EVENTS):
                 part = slice(first, min(end, first + MAX_EVENTS))
-                self._add(
-                    x[part], y[part], polarity[part] == self._on_bit, stamps_ns[part], int(board_us[first])
-                )
-
-    def _add(
-        self, x: NDArray[np.uint8], y: NDArray[np.uint8], is_on: BoolArray, stamps_ns: IntArray, board_us: int
-    ) -> None:
-        if self._waiting:
-            since_ns = stamps_ns[-1] - self._waiting[0][3][0]
-            steps_back = stamps_ns[0] < self._waiting[-1][3][-1]
-            if steps_back or since_ns > 2 * self._period_ns or self._count + len(x) > MAX_EVENTS:
-                self.flush()
-        if not self._waiting:
-            self._board_ns = 1000 * board_us
-        self._waiting.append((x, y, is_on, stamps_ns))
-        self._count += len(x)
-        if stamps_ns[-1] - self._waiting[0][3][0] >= self._period_ns:
-            self.flush()
+                count, part_ns = part.stop - first, stamps_ns[part]
+                # end the packet where time steps back, or where it would be too long
+                if self._waiting:
+                    since_ns = part_ns[-1] - self._waiting[0][3][0]
+                    steps_back = part_ns[0] < self._waiting[-1][3][-1]
+                    if steps_back or since_ns > 2 * self._period_ns or self._count + count > MAX_EVENTS:
+                        self.flush()
+                if not self._waiting:
+                    self._board_ns = 1000 * int(board_us[first])
+                self._waiting.append((x[part], y[part], polarity[part] == self._on_bit, part_ns))
+                self._count += count
+                if part_ns[-1] - self._waiting[0][3][0] >= self._period_ns:
+                    self.flush()
 
     def flush_late(self, now_ns: int) -> None:
         """Complete the current packet if no later event has done so in time."""

@@ -41,6 +41,9 @@ class _Robot:
         self.fix: tuple[int, FloatArray] | None = None
         self.goal: tuple[int, FloatArray] | None = None
 
+    def on_laser(self, message: LaserDistance) -> None:
+        self.motion.take_distance(message.distance)
+
 
 class ExplorationNode(ConfiguredNode[ExplorationParameters]):
     """Turns goals and odometry into velocities."""
@@ -53,7 +56,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         self._commands = [self.create_publisher(Twist, f"{name}/cmd_vel", 1) for name in self._names]
         for index, name in enumerate(self._names):
             self.create_subscription(Odometry, f"{name}/odom", partial(self._on_odometry, index), _QOS)
-            self.create_subscription(LaserDistance, f"{name}/laser", partial(self._on_laser, index), _QOS)
+            self.create_subscription(LaserDistance, f"{name}/laser", self._robots[index].on_laser, _QOS)
             self.create_subscription(
                 PoseWithCovarianceStamped, f"{name}/fix", partial(self._on_fix, index), _QOS
             )
@@ -84,9 +87,6 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             return
         forward, _, rate = robot.motion.command(stamp_ns, pose)
         self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
-
-    def _on_laser(self, index: int, message: LaserDistance) -> None:
-        self._robots[index].motion.take_distance(message.distance)
 
     def _on_fix(self, index: int, message: PoseWithCovarianceStamped) -> None:
         self._robots[index].fix = (nanoseconds(message.header.stamp), _planar(message.pose.pose))

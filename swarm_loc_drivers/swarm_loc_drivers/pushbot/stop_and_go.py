@@ -52,24 +52,15 @@ class MapGoal(NamedTuple):
     position: FloatArray  # (2,) goal in map [m]
 
 
-@dataclass
-class _Turn:
-    """Turn to a heading by odometry [rad, not wrapped], at a rate [rad/s]."""
-
-    heading: float
-    rate: float
-
-
-@dataclass
-class _Look:
-    """Turn by an angle [rad] at a rate [rad/s]."""
+class _Turn(NamedTuple):
+    """Turn to a heading by odometry [rad, not wrapped], or by an angle [rad], at a rate [rad/s]."""
 
     angle: float
     rate: float
+    is_heading: bool = False
 
 
-@dataclass
-class _Drive:
+class _Drive(NamedTuple):
     """Drive ahead for a length [m]."""
 
     length: float
@@ -89,8 +80,8 @@ class StopAndGo:
         """Reset and begin with the first scan."""
         rate = self._settings.turn_rate
         self.ratio = 1.0  # Estimated true turn per turn by odometry
-        self._moves: deque[_Turn | _Look | _Drive] = deque(
-            [_Look(_SLOW_TURN, _SLOW_SHARE * rate), _Look(START_TURN - _SLOW_TURN, _FIRST_SHARE * rate)]
+        self._moves: deque[_Turn | _Drive] = deque(
+            [_Turn(_SLOW_TURN, _SLOW_SHARE * rate), _Turn(START_TURN - _SLOW_TURN, _FIRST_SHARE * rate)]
         )
         self._track: deque[tuple[int, float, float, float]] = deque(maxlen=_MAX_REMEMBERED)
         self._anchor: FloatArray | None = None
@@ -139,8 +130,8 @@ class StopAndGo:
             around = 2.0 * math.pi / self.ratio
             now = self._track[-1][3]
             heading += around * round((now - heading) / around)
-            self._moves += [_Turn(heading, self._settings.turn_rate), _Drive(length)]
-        self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
+            self._moves += [_Turn(heading, self._settings.turn_rate, is_heading=True), _Drive(length)]
+        self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
         return True
 
     def command(self, stamp_ns: int, pose: FloatArray) -> Velocity:
@@ -158,10 +149,10 @@ class StopAndGo:
             # after a restart, scans of several places tell the mapper where it is
             if self.restarts and self._goal_ns < 0:
                 if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
-                    self._moves.append(_Turn(self._open_heading, self._settings.turn_rate))
+                    self._moves.append(_Turn(self._open_heading, self._settings.turn_rate, is_heading=True))
                 self._moves.append(_Drive(_BLIND_DRIVE))
             self._farthest = 0.0
-            self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
+            self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
         return STILL
 
     def _remember(self, stamp_ns: int, pose: FloatArray) -> FloatArray:
@@ -182,7 +173,7 @@ class StopAndGo:
         self._track.append((stamp_ns, x, y, theta))
         return np.array([x, y, theta])
 
-    def _towards(self, move: _Turn | _Look | _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
+    def _towards(self, move: _Turn | _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
         """Velocity of a move at a pose (3,) by odometry; None when the move is done."""
         if isinstance(move, _Drive):
             left = move.length - math.dist(now[:2], begin[:2])
@@ -191,7 +182,7 @@ class StopAndGo:
                 return speed, 0.0, _COURSE_GAIN * float(begin[2] - now[2])
             self.halts += left >= _ARRIVED
             return None
-        heading = move.heading if isinstance(move, _Turn) else begin[2] + move.angle
+        heading = move.angle if move.is_heading else begin[2] + move.angle
         left = heading - now[2]
         is_beyond = (heading - begin[2]) * left <= 0.0
         if abs(left) < _TURNED or is_beyond:

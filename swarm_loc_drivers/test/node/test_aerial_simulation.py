@@ -1,7 +1,5 @@
 """Everything over DDS under an overhead camera: robots of unknown start find themselves in its images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

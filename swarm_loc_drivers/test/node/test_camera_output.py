@@ -1,7 +1,5 @@
 """Nobody gets a simulated camera's image before its calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from node_world import Ros

@@ -1,7 +1,5 @@
 """The Droplet's driver node over DDS, with emulated robots in a process of their own."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal

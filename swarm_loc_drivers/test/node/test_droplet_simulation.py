@@ -1,7 +1,5 @@
 """`simulate` with Droplets over DDS: infrared alone locates those that nobody has seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The whole chain of Droplets over DDS: steering, drivers, consoles, one world, its clock and its tracker."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The driver node in this process, on a clock that the test sets: simulated time, pictures."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time

@@ -1,7 +1,5 @@
 """The driver node over DDS, with emulated robots in processes of their own."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time

@@ -1,7 +1,5 @@
 """Events are of the type of event_camera_msgs where that is installed, else of our copy."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """PushBots over DDS: world, driver and tracker as processes, their bytes on TCP and on a serial port."""
 
-from __future__ import annotations
-
 import math
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`simulate` from its start to a signal that stops it: no robot is left moving, and no link is missed."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

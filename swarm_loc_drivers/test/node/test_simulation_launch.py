@@ -1,7 +1,5 @@
 """The launch file starts what the `simulate` command starts, or says why not and ends with an error."""
 
-from __future__ import annotations
-
 import atexit
 import tempfile
 from collections.abc import Callable

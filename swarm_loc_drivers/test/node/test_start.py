@@ -1,7 +1,5 @@
 """Executables of all packages end by a signal without a traceback while they still import."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

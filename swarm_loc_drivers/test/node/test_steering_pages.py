@@ -1,7 +1,5 @@
 """The pages under doc/ have the parameters of the steering nodes, which stand in the nodes' own modules."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

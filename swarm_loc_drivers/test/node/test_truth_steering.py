@@ -1,7 +1,5 @@
 """Robots are steered from when all of them have sent odometry."""
 
-from __future__ import annotations
-
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from node_world import Ros

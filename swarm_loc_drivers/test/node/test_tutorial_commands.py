@@ -1,7 +1,5 @@
 """The commands of tutorials, word by word, with simulated robots."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import signal

@@ -1,7 +1,5 @@
 """Everything at once over DDS: images, firmware, drivers, detectors and estimator give true poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole chain over DDS: steering, drivers, emulated firmware, one world, its clock and its cameras."""
 
-from __future__ import annotations
-
 import signal
 import socket
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The emulated Droplet answers its console as the published firmware does."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from droplet_rig import IDS, TRIANGLE, print_2014, print_2016, world_of

@@ -1,7 +1,5 @@
 """From velocities to a Droplet's few motions, and from commands to poses and how sure they are."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

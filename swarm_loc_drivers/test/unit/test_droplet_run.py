@@ -1,7 +1,5 @@
 """A simulated swarm of Droplets: where they go, what they measure, and what a bag of it holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conversations with emulated Droplets in simulated time: exchanges, turns, losses, and what is not right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

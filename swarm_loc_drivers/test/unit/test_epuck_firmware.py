@@ -1,7 +1,5 @@
 """The emulated firmware answers bytes as the robots' documentation and sources say."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

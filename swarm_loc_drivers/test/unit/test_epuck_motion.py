@@ -1,7 +1,5 @@
 """From velocities to wheels and from steps to poses."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

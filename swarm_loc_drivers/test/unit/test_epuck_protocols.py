@@ -1,7 +1,5 @@
 """The e-pucks' bytes: as documented, in pieces of any size, and with garbage between them."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Conversations with e-pucks, bytes in and bytes out, by a clock that only the test moves."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace

@@ -1,6 +1,4 @@
-"""Floor plans from files: walls, maps as images, and what is wrong with a file in one sentence."""
-
-from __future__ import annotations
+"""Floor plans: files, built-in halls, and drives along walls."""
 
 import json
 import math
@@ -10,11 +8,26 @@ import cv2
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan, ray_distance
+from bench.pushbot.runs import wall_points
+from swarm_loc_drivers.sim.pushbot.floor_plan import (
+    FLOOR_PLANS,
+    FloorPlan,
+    FloorPlanError,
+    clearance,
+    floor_plan,
+    is_visible,
+    outline,
+    polygon,
+    ray_distance,
+)
+from swarm_loc_drivers.sim.pushbot.optics import assembled
+from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorldParameters, make_pushbot_world
 from swarm_loc_drivers.sim.simulation import SimulationOptions, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WorldError
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, UserError
+from swarm_loc_vision.laser.calibration import RowBias, fit_hyperbola
 
 SWARM = """
 fileversion: 1
@@ -145,3 +158,66 @@ def test_a_robot_in_a_wall_of_a_file_is_named(tmp_path: Path) -> None:
     plan = written(tmp_path, "free: [[0, 0, 2, 2]]\ncolumns: [[0.9, 0.9, 1.02, 1.02]]\n")
     with pytest.raises((ParameterError, WorldError), match="robot 1 of the swarm begins within a wall"):
         make_pushbot_world(PushbotWorldParameters(swarm_file=swarm_file, plan=plan))
+
+
+ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))
+
+
+def test_rays_end_at_walls_and_robots() -> None:
+    discs = np.array([[1.0, 2.5]])
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, 0.0) == pytest.approx(1.0)
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi / 2) == pytest.approx(0.94)
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi) == pytest.approx(1.0)
+    assert clearance(ROOM.walls, discs, 0.06, 1.8, 1.5) == pytest.approx(0.2)
+    assert clearance(ROOM.walls, discs, 0.06, 1.0, 2.3) == pytest.approx(0.14)
+    assert is_visible(ROOM.walls, 1.0, 2.5, 3.5, 2.5)
+    assert not is_visible(ROOM.walls, 1.0, 1.5, 3.5, 1.5)
+
+
+def test_rays_end_at_slanted_walls() -> None:
+    walls = polygon([(0, 0), (2, 0), (0, 2)])
+    assert ray_distance(walls, np.zeros((0, 2)), 0.06, 0.5, 0.5, math.pi / 4) == pytest.approx(math.sqrt(0.5))
+
+
+@pytest.mark.parametrize("name", sorted(FLOOR_PLANS))
+def test_robots_start_inside_closed_halls(name: str) -> None:
+    plan = floor_plan(name)
+    nobody = np.zeros((0, 2))
+    for x, y in plan.starts:
+        assert clearance(plan.walls, nobody, 0.0, x, y) > 0.3
+        assert all(
+            math.isfinite(ray_distance(plan.walls, nobody, 0.0, x, y, a)) for a in np.linspace(0, 6, 50)
+        )
+    lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
+    assert len(wall_points(plan, 0.1)) >= lengths.sum() / 0.1
+
+
+def test_an_unknown_hall_is_told() -> None:
+    with pytest.raises(FloorPlanError, match="no floor plan 'cave': it must be one of corridor,"):
+        floor_plan("cave")
+
+
+HALF_A_SECOND = 25  # Windows of the tracker
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_errors_of_rows_do_not_last(seed: int) -> None:
+    """What is left of them averages out over half a second; without the bias more lasts."""
+    built = assembled(np.random.default_rng(seed))
+    first, _ = drive_at_wall(np.random.default_rng([seed, 1]), built, WallDriveSettings(speed=0.25))
+    far_away = WallDriveSettings(start=2.4, stop=0.8)
+    other, depths = drive_at_wall(np.random.default_rng([seed, 2]), built, far_away)
+    found = fit_hyperbola(first)
+    far = (depths > 0.8) & (depths < 2.3)
+    rows, true_rows = other.rows[far], found.row_at_infinity + found.focal_base / depths[far]
+    left = rows - found.row_bias.at_each(rows) - true_rows
+    assert found.row_bias != RowBias()
+    assert lasting(left) < 0.6 * lasting(rows - true_rows)
+    assert lasting(left) < 0.03
+    assert 0.5 < np.std(left) / found.row_sigma < 1.5
+
+
+def lasting(errors: FloatArray) -> float:
+    """Standard deviation of errors averaged over half a second; one that all share is the hyperbola's."""
+    means = np.convolve(errors, np.full(HALF_A_SECOND, 1.0 / HALF_A_SECOND), mode="valid")
+    return float(np.std(means))

@@ -1,7 +1,5 @@
 """Swarms that `new` describes: numbers are those of drivers, commands exist, simulated robots are located."""
 
-from __future__ import annotations
-
 import re
 from configparser import ConfigParser
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stamps of events, packets, and odometry of PushBots."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

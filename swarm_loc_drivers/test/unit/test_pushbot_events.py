@@ -1,7 +1,5 @@
 """The parser of events and of lines between them: how bytes are cut does not matter, lost ones do little."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Command lines of an emulated PushBot against what firmware 0.7.1 says and does."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_drivers.pushbot.protocol import (

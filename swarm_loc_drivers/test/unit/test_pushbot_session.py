@@ -1,7 +1,5 @@
 """Conversations with emulated PushBots: handshake, streams, stalls, and wheels that must not run away."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pushbot_rig import PushbotWire, pushbot_params

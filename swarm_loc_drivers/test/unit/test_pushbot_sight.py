@@ -1,7 +1,5 @@
 """What event cameras see in a hall."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

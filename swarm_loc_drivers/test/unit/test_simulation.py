@@ -1,7 +1,5 @@
 """The list of a simulation's nodes, its command line, and how its world waits for those who see it."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A robot between the goals of a mapper: looks around, goes there though its wheels slip, and stops."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Threads in which emulated robots and controllers of tests go on."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A wire to an emulated robot that loses and twists bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware

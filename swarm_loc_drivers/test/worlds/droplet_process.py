@@ -3,8 +3,6 @@
 For every line of its input it says how they are: poses, and whether any moves.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

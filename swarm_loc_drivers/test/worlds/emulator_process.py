@@ -1,7 +1,5 @@
 """Emulated robots as a process, which says how they are for every line of its input."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A robot without a world around it: an exact differential drive whose every step and pose is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 It says where it answers, and for every line of its input how the robot is: pose, rates, steps.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

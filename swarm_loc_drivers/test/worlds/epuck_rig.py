@@ -1,7 +1,5 @@
 """What the driver's tests share: emulated robots in threads, a driver, and what it reports."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """A conversation with an emulated e-puck on one clock, a millisecond at a time: no links, no threads."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence

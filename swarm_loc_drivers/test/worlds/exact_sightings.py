@@ -1,7 +1,5 @@
 """What simulated cameras would have reported without noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

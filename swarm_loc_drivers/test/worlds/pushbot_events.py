@@ -1,7 +1,5 @@
 """Events of PushBots for tests, and their bytes, encoded apart from the emulator."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A session and an emulated PushBot in one world, without threads and without a clock."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from typing import Any

@@ -1,7 +1,5 @@
 """A small scene, and what an image of it must show, worked out by casting rays: slow and independent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """What the simulated bags of the repository say that they were made by, and whether that gives them again."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import is_dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A TCP connection to a robot that can be cut and mended, as a wireless one is."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from contextlib import suppress

@@ -23,7 +23,7 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.fit import calibrate
 from swarm_loc_estimator.offline.calibration.models import EVALUATIONS, Options
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
-from swarm_loc_estimator.offline.calibration.recording import Recording, joined, read_recording
+from swarm_loc_estimator.offline.calibration.recording import joined, read_recording
 from swarm_loc_estimator.offline.export import read_truth
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
@@ -43,31 +43,22 @@ _RUNS = f"runs of the estimator to fit the noise (default {EVALUATIONS})"
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    chosen = Options(
-        plain=options.plain,
-        response=not options.no_response,
-        evaluations=options.evaluations,
-        alone=options.alone,
-    )
+    kind = {"plain": options.plain, "response": not options.no_response, "alone": options.alone}
+    chosen = Options(**kind, evaluations=options.evaluations)
     if options.truth and len(options.bag) > 1:
         raise UserError("--truth is for one bag.")
     if len({bag.resolve() for bag in options.bag}) < len(options.bag):
         raise UserError(f"{', '.join(map(str, options.bag))}: a bag is given twice, which tells nothing new.")
     swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag[0]))
     with cli.ProgressLine() as progress:
-        truth = read_truth(options.truth, swarm)
-        recording = joined(
-            [read_recording(bag, swarm, progress, options.remap, truth) for bag in options.bag]
-        )
+        truth, remap = read_truth(options.truth, swarm), options.remap
+        recording = joined([read_recording(bag, swarm, progress, remap, truth) for bag in options.bag])
         done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {recording.name}. {done.warning}".rstrip())
-    print("\n".join([text_of(done), *recording.sentences(), *_unused(recording)]))
+    print("\n".join([text_of(done), *recording.sentences()]))
+    unused = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
+    said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in unused.items() if count)
+    if said:
+        print(f"Not used: {said}. Infrared boards are calibrated by calibrate_ir.")
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
-
-
-def _unused(recording: Recording) -> list[str]:
-    """A sentence if the bag has inputs that are not used."""
-    counts = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
-    said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in counts.items() if count)
-    return [f"Not used: {said}. Infrared boards are calibrated by calibrate_ir."] if said else []

@@ -22,7 +22,6 @@ from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_inf
 from swarm_loc_estimator.offline.calibration.plots import board_text, draw_board, draw_gains, gains_text
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.swarm.ir_board import save_ir_platform
-from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 _OUT = "out/calibrated_ir.yaml"
@@ -39,19 +38,15 @@ _OUT = "out/calibrated_ir.yaml"
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
     swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag))
-    if options.board is not None:
-        return _board(options, swarm)
-    with cli.ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress, options.remap)
-        done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
-    save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
-    print("\n".join([gains_text(done), *recording.sentences()]))
-    print(f"{options.out} written, picture: {draw_gains(done, options.out.with_suffix('.png'))}")
-    return 0
-
-
-def _board(options: argparse.Namespace, swarm: Swarm) -> int:
-    """Fit the parameters of the board, and write it and a swarm description that uses it."""
+    if options.board is None:
+        with cli.ProgressLine() as progress:
+            recording = read_recording(options.bag, swarm, progress, options.remap)
+            gains = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
+        save_swarm(gains.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
+        print("\n".join([gains_text(gains), *recording.sentences()]))
+        print(f"{options.out} written, picture: {draw_gains(gains, options.out.with_suffix('.png'))}")
+        return 0
+    # fit the parameters of the board, and write it and a swarm description that uses it
     with cli.ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         board, done = calibrate_from(recording, swarm, progress)

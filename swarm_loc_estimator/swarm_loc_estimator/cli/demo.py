@@ -24,15 +24,7 @@ from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.playback import clock_step_ns
-from swarm_loc_estimator.offline.live_run import (
-    Agreement,
-    BagContent,
-    LiveRun,
-    Recorder,
-    compare_with_replay,
-    play_live,
-    read_poses,
-)
+from swarm_loc_estimator.offline import live_run
 from swarm_loc_estimator.offline.report.report import REPORT_FILES, write_report
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -67,12 +59,11 @@ def main(options: argparse.Namespace) -> int:
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
     port = free_port()
     print(f"Watch it live: http://127.0.0.1:{port}/", flush=True)
-    graph = GraphOptions(
-        str(swarm_file), bag=str(options.bag), rate=options.rate, watch=True, watch_port=port
-    )
-    live = play_live(graph, log=options.out / "nodes.log", watch=progress)
+    bag, rate = str(options.bag), options.rate
+    graph = GraphOptions(str(swarm_file), bag=bag, rate=rate, watch=True, watch_port=port)
+    live = live_run.play_live(graph, log=options.out / "nodes.log", watch=progress)
     progress.close()
-    compared = compare_with_replay(live, options.bag)
+    compared = live_run.compare_with_replay(live, options.bag)
     files = write_report(live.result, options.out)
     print(files.text.read_text(encoding="utf-8"))
     print("\n".join(live_facts(live, compared)))
@@ -83,7 +74,7 @@ def main(options: argparse.Namespace) -> int:
     return 1 if failures else 0
 
 
-def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
+def live_facts(live: live_run.LiveRun, compared: live_run.Agreement) -> list[str]:
     """Performance of the live graph, in words."""
     # the time of reception is known to a step of /clock
     age_s = float(np.percentile(live.age_s, 95)) + 1e-9 * clock_step_ns(live.rate)
@@ -99,18 +90,12 @@ def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
     return [live_line, replay_line]
 
 
-def failed_bars(live: LiveRun) -> list[str]:
+def failed_bars(live: live_run.LiveRun) -> list[str]:
     """One sentence for each limit that the poses exceed."""
-    result = live.result
-    row = result.overall
-    heading_deg = math.degrees(row.heading_rmse)
-    waiting = [
-        robot.name
-        for robot, status in zip(result.swarm.robots, result.status[-1], strict=True)
-        if status != Status.TRACKED
-    ]
-    share = coverage(live)
-    failures = []
+    result, row, failures = live.result, live.result.overall, []
+    heading_deg, share = math.degrees(row.heading_rmse), coverage(live)
+    states = zip(result.swarm.robots, result.status[-1], strict=True)
+    waiting = [robot.name for robot, status in states if status != Status.TRACKED]
     if not row.position_rmse < _POSITION_M:
         failures.append(f"Position RMSE is {row.position_rmse:.4f} m, not below {_POSITION_M} m.")
     if not heading_deg < _HEADING_DEG:
@@ -124,13 +109,11 @@ def failed_bars(live: LiveRun) -> list[str]:
     return failures
 
 
-def coverage(live: LiveRun) -> float:
+def coverage(live: live_run.LiveRun) -> float:
     """Share of the ground truth that has an estimated pose."""
     result = live.result
-    there = [
-        interpolate(result.track(result.swarm.index_of[name]), truth.stamp_ns, _GAP_NS)[1]
-        for name, truth in result.truth.items()
-    ]
+    tracks = ((result.track(result.swarm.index_of[name]), truth) for name, truth in result.truth.items())
+    there = [interpolate(track, truth.stamp_ns, _GAP_NS)[1] for track, truth in tracks]
     return float(np.concatenate(there).mean()) if there else 0.0
 
 
@@ -142,8 +125,7 @@ class _Progress:
         self._in_terminal = sys.stdout.isatty()
         self._said_s = 0.0
 
-    def __call__(self, recorder: Recorder, content: BagContent) -> None:
-        """Update the progress from the poses received."""
+    def __call__(self, recorder: live_run.Recorder, content: live_run.BagContent) -> None:
         pause_s = _REDRAW_S if self._in_terminal else _REDRAW_UNWATCHED_S
         if time.monotonic() < self._said_s + pause_s:
             return
@@ -152,26 +134,20 @@ class _Progress:
         print(f"\r{line}\x1b[K" if self._in_terminal else f"{line}\n", end="", flush=True)
 
     def close(self) -> None:
-        """End the line."""
         if self._in_terminal:
             print()
 
-    def _line(self, recorder: Recorder, content: BagContent) -> str:
-        poses = read_poses(recorder.raw[-1])
+    def _line(self, recorder: live_run.Recorder, content: live_run.BagContent) -> str:
+        poses = live_run.read_poses(recorder.raw[-1])
         at_s = (poses.stamp_ns - content.begin_ns) * 1e-9
         tracked = int(np.sum(poses.status == Status.TRACKED))
         errors = []
         for index, robot in enumerate(self._swarm.robots):
             if robot.name in content.truth:
-                stamp = np.array([poses.stamp_ns])
-                truth, _ = interpolate(content.truth[robot.name], stamp, _GAP_NS)
+                truth, _ = interpolate(content.truth[robot.name], np.array([poses.stamp_ns]), _GAP_NS)
                 errors.append(se2.between(truth[0], poses.pose[index])[:2])
-        known = np.array(errors).reshape(-1, 2)
-        known = known[np.isfinite(known).all(axis=1)]
-        rms = (
-            f", error {1e3 * math.sqrt(float(np.mean(np.sum(known**2, axis=1)))):4.1f} mm"
-            if len(known)
-            else ""
-        )
+        squares = np.sum(np.array(errors).reshape(-1, 2) ** 2, axis=1)
+        squares = squares[np.isfinite(squares)]
+        rms = f", error {1e3 * math.sqrt(float(np.mean(squares))):4.1f} mm" if squares.size else ""
         total_s = (content.end_ns - content.begin_ns) * 1e-9
         return f"  {at_s:5.1f} of {total_s:.1f} s, {tracked} of {len(poses.status)} robots tracked{rms}"

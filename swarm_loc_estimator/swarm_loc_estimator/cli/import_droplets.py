@@ -14,12 +14,7 @@ import argparse
 from pathlib import Path
 
 from swarm_loc_estimator.common.command_line import ProgressLine, argument, bag_to_write, command, number_in
-from swarm_loc_estimator.offline.datasets.droplets import (
-    METRES_PER_PIXEL,
-    ImportSettings,
-    import_recording,
-    name_of,
-)
+from swarm_loc_estimator.offline.datasets import droplets
 
 _SCALE = "of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)"
 
@@ -29,18 +24,19 @@ _SCALE = "of the camera's image (default: robots of 44 mm that touch are 42 pixe
     argument("recording", type=Path, help="text file, one exchange a line"),
     argument("bag", type=bag_to_write, help="bag folder to create"),
     argument("--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"),
-    argument("--metres-per-pixel", type=number_in(1e-6, 1.0, "m"), default=METRES_PER_PIXEL, help=_SCALE),
+    argument(
+        "--metres-per-pixel", type=number_in(1e-6, 1.0, "m"), default=droplets.METRES_PER_PIXEL, help=_SCALE
+    ),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    settings = ImportSettings(options.platform, options.metres_per_pixel)
+    settings = droplets.ImportSettings(options.platform, options.metres_per_pixel)
     with ProgressLine() as progress:
-        done = import_recording(options.recording, options.bag, settings, progress)
+        done = droplets.import_recording(options.recording, options.bag, settings, progress)
     for remark in done.remarks:
         print(remark)
-    turned = ", ".join(
-        f"{name_of(robot)} {turn * 57.29578:+.0f}" for robot, turn in sorted(done.fiducials.turn_of.items())
-    )
+    turns = sorted(done.fiducials.turn_of.items())
+    turned = ", ".join(f"{droplets.name_of(robot)} {turn * 57.29578:+.0f}" for robot, turn in turns)
     mirrored = "" if done.fiducials.handedness == 1 else "; the image is mirrored"
     print(f"fiducials sit turned by [deg]: {turned}{mirrored}")
     print(f"{done.exchanges} exchanges, {done.with_truth} with ground truth, written to {options.bag}")

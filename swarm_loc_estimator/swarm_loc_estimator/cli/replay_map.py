@@ -38,10 +38,6 @@ _MAP = cli.folder_to_write("map.*", "stops.csv")
 _CONTRADICTED = 0.02  # Share of contradicted stops from which odometry is named
 
 
-class WallsError(UserError):
-    """An invalid file of walls."""
-
-
 @command(
     __doc__,
     cli.add_bag,
@@ -59,22 +55,18 @@ def main(options: argparse.Namespace) -> int:
     frequencies = led_frequencies(options.led, swarm.index_of)
     with cli.ProgressLine() as progress:
         mapper, feed, mounts = replay_map(options.bag, swarm, settings, frequencies, progress, options.remap)
-    missing = list(feed.missing())
     if not mapper.graph.count:
-        print(
-            f"There is no map: nothing usable came on {', '.join(missing) or 'the topics'}.", file=sys.stderr
-        )
+        missing = ", ".join(feed.missing()) or "the topics"
+        print(f"There is no map: nothing usable came on {missing}.", file=sys.stderr)
         return 1
     path, image = save_map(mapper.occupancy(), options.out / "map")
-    numbers = {robot.name: feed.number(index) for index, robot in enumerate(swarm.robots)}
+    numbers = ((feed.number(index), robot.name) for index, robot in enumerate(swarm.robots))
+    name_of = {number: name for number, name in numbers if number is not None}
     tracks = truth_of(options.bag, swarm)
-    truth = {
-        number: tracks[name] for name, number in numbers.items() if number is not None and name in tracks
-    }
+    truth = {number: tracks[name] for number, name in name_of.items() if name in tracks}
     figures = map_figures(mapper, truth, walls).sentence()
     title = f"{mapper.graph.count} stops" + (f"\n{figures}" if figures else "")
     picture = draw_map(mapper.occupancy(), mapper.graph.poses, walls, options.out / "map.png", title)
-    name_of = {number: name for name, number in numbers.items() if number is not None}
     write_stops(mapper, name_of, options.out / "stops.csv")
     for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
@@ -103,19 +95,15 @@ def findings(mapper: CooperativeMapper, name_of: Mapping[int, str]) -> Iterator[
 
 
 def read_walls(path: Path) -> FloatArray:
-    """Walls (S, 4) from lines x0,y0,x1,y1 [m].
-
-    Raises:
-        WallsError: The file cannot be read, or is no such table.
-    """
+    """Walls (S, 4) from lines x0,y0,x1,y1 [m]; raises UserError if the file is no such table."""
     try:
         walls = np.loadtxt(path, delimiter=",", ndmin=2)
     except OSError as error:
-        raise WallsError(f"The walls '{path}' cannot be read: {error.strerror or error}.") from error
-    except ValueError as error:
-        raise WallsError(f"'{path}' is no table of x0,y0,x1,y1.") from error
+        raise UserError(f"The walls '{path}' cannot be read: {error.strerror or error}.") from error
+    except ValueError:
+        walls = np.full((1, 4), np.nan)
     if walls.ndim != 2 or walls.shape[1] != 4 or not np.isfinite(walls).all():
-        raise WallsError(f"'{path}' is no table of x0,y0,x1,y1.")
+        raise UserError(f"'{path}' is no table of x0,y0,x1,y1.")
     return walls
 
 

@@ -51,7 +51,16 @@ def main(options: argparse.Namespace) -> int:
         if live:
             listen = import_module("swarm_loc_estimator.doctor.listener").listen
             where, seconds = (options.namespace, _is_used), options.seconds or _LIVE_S
-            recording = _heard(listen(swarm, seconds, progress, *where, use_sim_time=options.use_sim_time))
+            heard: Evidence = listen(swarm, seconds, progress, *where, use_sim_time=options.use_sim_time)
+            recording = Recording(
+                "the live graph",
+                heard.odometry,
+                heard.rows("detections"),
+                {},
+                turn_rates=heard.turn_rates,
+                ranges=heard.rows("ranges"),
+                dropped=heard.converted[1].total,
+            )
         else:
             recording = read_recording(options.source, swarm, progress, options.remap)
         done = survey(recording, swarm, progress, cameras=options.all)
@@ -62,18 +71,4 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _is_used(message_type: str) -> bool:
-    """Whether a survey uses messages of a type."""
     return any(same_type(message_type, one.message_type) for one in kinds().values() if one.rows in _SENSORS)
-
-
-def _heard(evidence: Evidence) -> Recording:
-    """What was heard of a live graph."""
-    return Recording(
-        "the live graph",
-        evidence.odometry,
-        evidence.rows("detections"),
-        {},
-        turn_rates=evidence.turn_rates,
-        ranges=evidence.rows("ranges"),
-        dropped=evidence.converted[1].total,
-    )

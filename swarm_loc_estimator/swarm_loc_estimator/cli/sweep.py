@@ -21,7 +21,7 @@ from pathlib import Path
 from swarm_loc_estimator.common.command_line import ProgressLine, argument, command, folder_to_write
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.sweep.report import SWEEP_FILES, rows_of, write_results
-from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, read_sweep, run_fit, run_sweep
+from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Line, read_sweep, run_fit, run_sweep
 
 
 @command(
@@ -48,17 +48,12 @@ def main(options: argparse.Namespace) -> int:
         page = write_results(rows, sweep.varied, options.out)
     print(f"{len(rows)} replays\nTable: {options.out / 'table.csv'}\nPage:  {page}")
     if best is not None:
-        print(_text_of(best))
+        gained = "".join(f" --set {name}={value:.6g}" for name, value in best.values.items())
+        before = "" if best.mean_before is None else f", {best.mean_before:.6g} with the defaults"
+        print(f"Best: {gained}\n       mean {best.minimized} {best.mean:.6g}{before}")
     if failed := [row for row in rows if row["failure"]]:
         first = f"the first: {failed[0]['failure']}"
         print(f"{len(failed)} of {len(rows)} replays failed, {first}", file=sys.stderr)
     if fit is not None and best is None:
         print(f"No trial has {fit.minimize} of all its replays.", file=sys.stderr)
     return int(bool(failed) or (fit is not None and best is None))
-
-
-def _text_of(best: Best) -> str:
-    """The best values as options, and what they gain."""
-    options = "".join(f" --set {name}={value:.6g}" for name, value in best.values.items())
-    before = "" if best.mean_before is None else f", {best.mean_before:.6g} with the defaults"
-    return f"Best: {options}\n       mean {best.minimized} {best.mean:.6g}{before}"

@@ -40,19 +40,11 @@ def main(options: argparse.Namespace) -> int:
 
 
 def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
-    """The nodes that the command line asks for.
-
-    Raises:
-        UserError: A file cannot be used.
-    """
+    """The nodes that the command line asks for; raises UserError if a file cannot be used."""
     is_bag = not cli.is_description(options.source)
     swarm_file = cli.described(options)
-    graph = GraphOptions(
-        str(swarm_file),
-        bag=str(options.source) if is_bag else None,
-        rate=options.rate,
-        use_sim_time=options.use_sim_time,
-    )
+    bag, on_sim_time = str(options.source) if is_bag else None, options.use_sim_time
+    graph = GraphOptions(str(swarm_file), bag=bag, rate=options.rate, use_sim_time=on_sim_time)
     check_graph(graph)
     page: dict[str, ParameterValue] = {
         "swarm_file": str(swarm_file),

@@ -1,7 +1,4 @@
-"""Between trees and dataclasses: the specification of a field reads, writes and describes it.
-
-Entries of files are the fields that `number` makes or that have the metadata of `entry`.
-"""
+"""Between trees and dataclasses: specs of fields, of `number` or `entry`, read, write and describe them."""
 
 from __future__ import annotations
 
@@ -122,7 +119,6 @@ def to_tree(holder: Any, keep: Collection[str] = (), without: Collection[str] = 
 
 
 def _lists(value: Any) -> Tree:
-    """Tuples as lists, which YAML has."""
     return [_lists(item) for item in value] if isinstance(value, tuple) else value
 
 

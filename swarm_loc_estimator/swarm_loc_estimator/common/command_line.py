@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
@@ -44,9 +45,8 @@ _FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
 class Program:
     """An entry point that imports a module only when it is called, and then runs its function.
 
-    SIGINT, and SIGTERM during the import, end it at once with status 128 + n and without a traceback: else
-    an exception might be swallowed where a compiler has called back. Some programs set other handlers. A
-    missing package of others is one sentence and status 1.
+    SIGINT, and SIGTERM during the import, end it at once with status 128 + n: an exception might be swallowed
+    where a compiler has called back. A missing package of others is one sentence and status 1.
     """
 
     module: str  # Full name of the module
@@ -66,7 +66,11 @@ class Program:
             missing = (error.name or "").partition(".")[0]
             if missing == self.module.partition(".")[0]:
                 raise
-            print(f"{Path(sys.argv[0]).name} {_needs(missing)}.", file=sys.stderr)
+            advice = f": pip install {' '.join(_FOR_BAGS)}" if missing in _FOR_BAGS else ""
+            need = f"the Python package {missing}, which is not installed{advice}"
+            if missing in _ROS or missing.endswith("_msgs"):
+                need = f"ROS 2 and this workspace, built and sourced: there is no Python package {missing}"
+            print(f"{Path(sys.argv[0]).name} needs {need}.", file=sys.stderr)
             return 1
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done, and Python's end gives up handlers
         return status
@@ -75,14 +79,6 @@ class Program:
 def _leave(number: int, _frame: object) -> None:
     os.write(2, f"Stopped by {signal.Signals(number).name}.\n".encode())
     os._exit(128 + number)
-
-
-def _needs(missing: str) -> str:
-    """What a program needs that cannot import a package, and how to get it."""
-    if missing in _ROS or missing.endswith("_msgs"):
-        return f"needs ROS 2 and this workspace, built and sourced: there is no Python package {missing}"
-    advice = f": pip install {' '.join(_FOR_BAGS)}" if missing in _FOR_BAGS else ""
-    return f"needs the Python package {missing}, which is not installed{advice}"
 
 
 def exit_with_message(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
@@ -110,6 +106,9 @@ def command_parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=description, formatter_class=formatter)
 
 
+Add = Callable[[argparse.ArgumentParser], object]  # Adds options to a parser
+
+
 class EntryPoint(Protocol):
     """A command as it is called."""
 
@@ -118,7 +117,7 @@ class EntryPoint(Protocol):
 
 
 def command(
-    description: str | None, *add: Callable[[argparse.ArgumentParser], object]
+    description: str | None, *add: Add
 ) -> Callable[[Callable[[argparse.Namespace], int]], EntryPoint]:
     """Decorate the `main` of a command, which gets the options that `add` has put into its parser."""
 
@@ -135,7 +134,7 @@ def command(
     return decorated
 
 
-def argument(*names: str, **about: Any) -> Callable[[argparse.ArgumentParser], object]:
+def argument(*names: str, **about: Any) -> Add:
     """An argument of a command, as `add_argument` of a parser has it."""
     return lambda parser: parser.add_argument(*names, **about)
 
@@ -149,9 +148,8 @@ def number_in(low: Number, high: Number, unit: str = "") -> Callable[[str], Numb
         except ValueError:
             value = None
         if value is None or not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f"{text} must be a number in [{low:g}, {high:g}]{unit and ' '}{unit}"
-            )
+            what = f"a number in [{low:g}, {high:g}]{unit and ' '}{unit}"
+            raise argparse.ArgumentTypeError(f"{text} must be {what}")
         return value
 
     return read
@@ -179,10 +177,7 @@ def bag_to_write(text: str) -> Path:
 
 
 def file_to_write(*suffixes: str, picture: str = "") -> Callable[[str], Path]:
-    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet.
-
-    A `picture` of the same name and this suffix can be written, too.
-    """
+    """A type for argparse: a file of these suffixes that can be written, as can a `picture` of its name."""
 
     def read(text: str) -> Path:
         path = Path(text)
@@ -229,10 +224,7 @@ _DESCRIPTIONS = (".yaml", ".yml")
 
 
 def add_live_or_bag(parser: argparse.ArgumentParser, seconds: str) -> None:
-    """Add the arguments of a command that listens to a live graph or reads a bag, see `is_live`.
-
-    `seconds` is what --seconds says.
-    """
+    """Add the arguments of a command for a live graph or a bag, see `is_live`; `seconds` is help of one."""
     parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml next to the bag)")
     parser.add_argument("--seconds", type=number_in(1.0, 3600.0, "s"), help=seconds)
@@ -242,11 +234,7 @@ def add_live_or_bag(parser: argparse.ArgumentParser, seconds: str) -> None:
 
 
 def is_live(options: argparse.Namespace) -> bool:
-    """Whether a live graph is meant, since the source is a description.
-
-    Raises:
-        UserError: Options do not fit the source, or the namespace is none.
-    """
+    """Whether the source is a description: a live graph; raises UserError if options do not fit it."""
     live = is_description(options.source)
     if live and options.remap:
         raise UserError("--remap is for bags; remap topics of a live graph in their nodes.")
@@ -286,10 +274,7 @@ def parameters_of(
 ) -> Parameters:
     """A dataclass of parameters from texts such as `horizon_s=1.0`, with defaults for the others.
 
-    Users cannot set the values that are `given` by name.
-
-    Raises:
-        ParameterError: There is no such parameter, or a value cannot be used.
+    Users cannot set what is `given` by name. Raises ParameterError if a value cannot be used.
     """
     specs = {spec.name: spec for spec in parameter_specs(cls)}
     values = {name: spec.default for name, spec in specs.items()} | {**given}
@@ -298,27 +283,21 @@ def parameters_of(
         if name not in specs or name in given:
             known = ", ".join(name for name in specs if name not in given)
             raise ParameterError(f"--set {pair}: '{name}' is no parameter; there are {known}.")
-        values[name] = specs[name].checked(_value(text, specs[name].default))
+        value: object = text
+        default = specs[name].default  # a text that cannot be converted is refused below
+        with suppress(ValueError):
+            if isinstance(default, tuple):
+                value = [part for part in text.split(",") if part]
+            elif isinstance(default, bool):
+                value = {"true": True, "false": False}.get(text, text)
+            else:
+                value = type(default)(text)
+        values[name] = specs[name].checked(value)
     return from_values(cls, values)
 
 
-def _value(text: str, default: Value) -> object:
-    """A text converted to the type of the default; unchanged, and refused later, if that is impossible."""
-    if isinstance(default, tuple):
-        return [part for part in text.split(",") if part]
-    if isinstance(default, bool):
-        return {"true": True, "false": False}.get(text, text)
-    try:
-        return type(default)(text)
-    except ValueError:
-        return text
-
-
 class ProgressLine:
-    """A progress bar in one line of a terminal, cleared at the end; silent where the stream is no terminal.
-
-    The stream is standard error by default.
-    """
+    """A progress bar in one line of a terminal, by default standard error, cleared at the end; else none."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream

@@ -38,9 +38,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """Path of a new file on the disk of `path`, whose folder is created, to replace it without an error.
 
     It has no name until it is whole, so that a kill leaves nothing, but on file systems without such files.
-
-    Raises:
-        FileError: The file cannot be written, or is a link or no regular file.
+    Raises FileError if it cannot be written, or is a link or no regular file.
     """
     part = path.with_name(f".{secrets.token_hex(8)}.part")  # nobody can put a link there before
     with naming(path), ExitStack() as stack:

@@ -1,7 +1,4 @@
-"""Graphs of nodes: as data, as child processes that end together, and as actions of `ros2 launch`.
-
-`ros2 launch swarm_loc_estimator swarm.launch.py` and the `graph` command start the same nodes.
-"""
+"""Graphs of nodes: as data, as child processes that end together, and as actions of `ros2 launch`."""
 
 from __future__ import annotations
 
@@ -24,6 +21,8 @@ from swarm_loc_estimator.common.parameters import ParameterError, UserError, fla
 from swarm_loc_estimator.common.yaml_tree import read_tree
 
 Options = TypeVar("Options")
+Choices = Mapping[str, Sequence[str]]  # Option -> the texts that it may be
+NO_CHOICES: Choices = MappingProxyType({})
 ParameterValue = bool | int | float | str | list[str]
 
 GRACE_S = 5.0  # Timeout of processes after SIGINT, and again after SIGTERM
@@ -38,10 +37,7 @@ ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 if os.getppid() == int(sys.argv[1]):
     os.execv(sys.argv[2], sys.argv[2:])
 """
-"""Runs in a process before its program; between fork and exec only C code would be safe.
-
-The program gets SIGINT when it asks for it, as `Program` does: while Python starts, that is a traceback.
-"""
+"""Runs before a program, which gets SIGINT when it asks for it; after a fork only C code is safe."""
 
 
 class GraphError(UserError):
@@ -122,7 +118,7 @@ def parsed_options(
     kind: type[Options],
     description: str | None,
     arguments: Sequence[str] | None,
-    choices: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    choices: Choices = NO_CHOICES,
 ) -> Options:
     """A dataclass of options from a command line; some texts must be among `choices`."""
     parser = command_parser(description)
@@ -143,7 +139,7 @@ def parsed_options(
     return kind(**vars(parser.parse_args(arguments)))
 
 
-def launch_arguments(kind: type, choices: Mapping[str, Sequence[str]] = MappingProxyType({})) -> list[Any]:
+def launch_arguments(kind: type, choices: Choices = NO_CHOICES) -> list[Any]:
     """The same options as actions of `launch` that declare its arguments."""
     from launch.actions import DeclareLaunchArgument  # noqa: PLC0415 - `graph` works without launch
 
@@ -161,7 +157,6 @@ def launch_arguments(kind: type, choices: Mapping[str, Sequence[str]] = MappingP
 
 
 def _argument(option: Field[Any]) -> str:
-    """The name of an option in command lines."""
     return {"parameter_file": "params_file"}.get(option.name, option.name)
 
 
@@ -171,16 +166,11 @@ def _doc(option: Field[Any]) -> str:
 
 
 def options_from(kind: type[Options], texts: Mapping[str, str]) -> Options:
-    """A dataclass of options from the texts of a `launch.LaunchContext`; an empty one means the default.
-
-    Raises:
-        ParameterError: An option is missing, or is not a number in its range.
-    """
+    """A dataclass of options from texts of a `launch.LaunchContext`, "": default; raises ParameterError."""
     return kind(**{one.name: _value(one, texts.get(_argument(one), "")) for one in fields(kind)})  # type: ignore[arg-type]
 
 
 def _value(option: Field[Any], text: str) -> object:
-    """The text of an option, converted to the type of its default."""
     default: Any = option.default
     if not text:
         if default is MISSING:
@@ -206,7 +196,6 @@ def check_parameter_file(path: str | None) -> None:
 
 
 def _has_parameters(tree: object) -> bool:
-    """Whether some node gets parameters, in whatever namespace."""
     return isinstance(tree, dict) and ("ros__parameters" in tree or any(map(_has_parameters, tree.values())))
 
 
@@ -254,15 +243,10 @@ def print_line(line: str) -> None:
 
 
 def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None] = print_line) -> int:
-    """Run nodes until a required one ends or this process gets SIGINT or SIGTERM; then end all of them.
+    """Run nodes, in their order, until a required one ends or this process gets SIGINT or SIGTERM; end all.
 
-    They start in their order. `say` gets each line for the user.
-
-    Returns:
-        0 after a signal, else the exit status of the required node that ended (128 + n after signal n).
-
-    Raises:
-        GraphError: An executable is missing; nothing was started.
+    `say` gets each line for the user. Returns 0 after a signal, else the status of the required node that
+    ended (128 + n after signal n). Raises GraphError if an executable is missing; then nothing was started.
     """
     commands = [node_command(node) for node in nodes]
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, AWAITED_SIGNALS)
@@ -278,10 +262,7 @@ def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None] = print_line
 
 
 def start(command: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
-    """Start a process that a terminal's Ctrl-C does not reach directly and that dies with this one.
-
-    Its standard output and error go to `output`; None: to those of this process.
-    """
+    """Start a process, with its output, out of reach of a terminal's Ctrl-C, that dies with this one."""
     return subprocess.Popen(
         [sys.executable, "-S", "-c", _TIED_TO_PARENT, str(os.getpid()), *command],
         stdout=output,

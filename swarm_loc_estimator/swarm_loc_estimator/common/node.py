@@ -1,7 +1,4 @@
-"""Shared parts of all nodes: parameters, start and stop, diagnostics, ticks and clocks, lifecycle.
-
-Managed nodes have the states, services and events of ROS 2's lifecycle, see `doc/lifecycle.md`.
-"""
+"""Shared parts of all nodes: parameters, start and stop, diagnostics, clocks, and doc/lifecycle.md."""
 
 from __future__ import annotations
 
@@ -53,17 +50,9 @@ from swarm_loc_estimator.common.parameters import (
 Parameters = TypeVar("Parameters")
 
 
-def declare_parameters(node: Node, cls: type) -> None:
-    """Declare the parameters of a dataclass, which may have any value until they are read."""
-    node.add_on_set_parameters_callback(_refuse_clock_change)
-    for spec in parameter_specs(cls):
-        node.declare_parameter(spec.name, spec.default, ParameterDescriptor(dynamic_typing=True))
-
-
 def read_parameters(node: Node, cls: type[Parameters], *, read_only: bool = True) -> Parameters:
     """The values of declared parameters, which are checked; see `read_parameter`."""
-    specs = parameter_specs(cls)
-    values = {spec.name: read_parameter(node, spec, read_only=read_only) for spec in specs}
+    values = {spec.name: read_parameter(node, spec, read_only=read_only) for spec in parameter_specs(cls)}
     return from_values(cls, values)
 
 
@@ -77,15 +66,19 @@ def _refuse_clock_change(parameters: Sequence[Parameter]) -> SetParametersResult
 def read_parameter(node: Node, spec: ParameterSpec, *, read_only: bool) -> Value:
     """The value of a declared parameter, which has its type and descriptor from now on.
 
-    rclpy would refuse a value with a traceback that lacks the unit. So the value is checked here, while the
-    parameter still has a dynamic type; then it gets its descriptor.
-
-    Raises:
-        ParameterError: The value has the wrong type or is out of range.
+    rclpy would refuse a value with a traceback that lacks the unit, so it is checked while the parameter has
+    a dynamic type; raises ParameterError.
     """
     value = spec.checked(node.get_parameter(spec.name).value)
-    node.set_parameters([Parameter(spec.name, _TYPES[type(spec.default)], value)])
-    node.set_descriptor(spec.name, _descriptor(spec, read_only=read_only))
+    kind, number = _TYPES[type(spec.default)], spec.number
+    node.set_parameters([Parameter(spec.name, kind, value)])
+    about = ParameterDescriptor(type=kind.value, description=spec.doc, read_only=read_only)
+    about.additional_constraints = spec.range_text
+    if number is not None and isinstance(spec.default, int):
+        about.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
+    elif number is not None:
+        about.floating_point_range = [FloatingPointRange(from_value=number.low, to_value=number.high)]
+    node.set_descriptor(spec.name, about)
     return value
 
 
@@ -98,47 +91,21 @@ _TYPES = {
 }
 
 
-def _descriptor(spec: ParameterSpec, *, read_only: bool) -> ParameterDescriptor:
-    """The descriptor that `ros2 param describe` prints."""
-    kind = _TYPES[type(spec.default)].value
-    descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=read_only)
-    descriptor.additional_constraints = spec.range_text
-    number = spec.number
-    if number is None:
-        return descriptor
-    if isinstance(spec.default, int):
-        descriptor.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
-    else:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=number.low, to_value=number.high)]
-    return descriptor
-
-
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 """Threshold for any backward jump of the clock."""
 _EACH_CHANGE = JumpThreshold(
     min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
 _WAKE_S = 0.2  # Maximum time until a signal is noticed while the node is idle [s]
-_LEAVE_S = 0.7
-"""The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
-20 s, since for each of them it announces all remaining ones."""
-_SHUTDOWN_S = 60.0
-"""A node that is being destroyed for so long never ends: Fast DDS may wait for a lock in shared memory that
-a killed process held."""
+_LEAVE_S = 0.7  # After a signal, even if busy: to destroy thousands of publishers takes DDS 20 s
+_SHUTDOWN_S = 60.0  # Then it never ends: Fast DDS may wait for a lock of a killed process
 _CLOCK_THROTTLE_S = 10.0
 _DIAGNOSTICS_PERIOD_S = 1.0
-_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""Name of a node that the middleware has not discovered yet, though its publisher."""
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # Of a node not discovered yet, though its publisher was
 
 
 def message_class(message_type: str) -> Any:
-    """The class of messages of a type, such as nav_msgs/msg/Odometry.
-
-    Of either of `EVENT_PACKETS` it is the one that nodes use.
-
-    Raises:
-        MessageTypeError: It is not installed.
-    """
+    """The class of messages of a type; of `EVENT_PACKETS` that which nodes use. Raises MessageTypeError."""
     for candidate in EVENT_PACKETS if message_type in EVENT_PACKETS else (message_type,):
         package, _, name = candidate.replace("/msg/", "/").partition("/")
         with suppress(ImportError, AttributeError):
@@ -154,15 +121,10 @@ class MessageTypeError(UserError):
     """A message type that is not installed."""
 
 
-class RosArgumentsError(UserError):
-    """The command line has ROS arguments that rcl cannot parse."""
-
-
 class Stop:
-    """Whether SIGINT or SIGTERM has been received.
+    """Whether SIGINT or SIGTERM has been received; before a node runs they raise KeyboardInterrupt.
 
     rclpy's own handlers invalidate the ROS context at once, so a callback that is publishing would fail.
-    Here a signal is only recorded while a node runs; before that it raises KeyboardInterrupt.
     """
 
     def __init__(self) -> None:
@@ -177,10 +139,7 @@ class Stop:
         self._is_deferred = True
 
     def leave_at_once(self) -> None:
-        """From now on end the process soon after a signal, with status 0, whatever it is doing.
-
-        Only for a node with nothing to finish: no robot to stop, no file to close.
-        """
+        """From now on end the process soon after a signal, with status 0: a node with nothing to finish."""
         self._leaves_at_once = True
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
@@ -197,20 +156,19 @@ class Stop:
 
 
 class ConfiguredNode(Node, Generic[Parameters]):
-    """A node whose parameters are those of a dataclass, see `declare_parameters`.
+    """A node whose parameters are those of a dataclass.
 
     Without `reads_parameters` they are not read, and `params` is not set. The name is the default one; other
-    arguments are those of `rclpy.node.Node`.
-
-    Raises:
-        UserError: A parameter, or a file that it names, cannot be used.
+    arguments are those of `rclpy.node.Node`. Raises UserError if a parameter or its file cannot be used.
     """
 
     def __init__(
         self, name: str, parameters: type[Parameters], *, reads_parameters: bool = True, **node_arguments: Any
     ) -> None:
         Node.__init__(self, name, **node_arguments)
-        declare_parameters(self, parameters)
+        self.add_on_set_parameters_callback(_refuse_clock_change)
+        for spec in parameter_specs(parameters):  # any value is taken until they are read
+            self.declare_parameter(spec.name, spec.default, ParameterDescriptor(dynamic_typing=True))
         if reads_parameters:
             self.params = read_parameters(self, parameters)  # Values of the parameters
         self.health = Health(self.get_logger().warning)  # Drops and problems for the log and /diagnostics
@@ -270,11 +228,8 @@ class ConfiguredNode(Node, Generic[Parameters]):
 def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_once: bool = False) -> int:
     """Create a node once ROS is initialized, run it until SIGINT or SIGTERM, and destroy it.
 
-    Errors have the name, that of the executable. With `leaves_at_once` the process ends soon after a signal
-    whatever it is doing, see `Stop`.
-
-    Returns:
-        The exit status: that of the node's `run`, 0 when stopped before, 1 after a mistake of the user.
+    Errors have the name, that of the executable; `leaves_at_once`: see `Stop`. Returns the exit status: that
+    of the node's `run`, 0 when stopped before, 1 after a mistake of the user.
     """
     node: ConfiguredNode[Any] | None = None
     stop = Stop()
@@ -306,17 +261,16 @@ def _start_ros() -> None:
         drop_negative_clocks()
         end_at_task_errors()
     except rclpy_implementation.UnknownROSArgsError as error:
-        raise RosArgumentsError(f"ROS does not know the arguments {error}.") from error
+        raise UserError(f"ROS does not know the arguments {error}.") from error
     except rclpy_implementation.RCLError as error:
-        raise RosArgumentsError(str(error).splitlines()[0]) from error
+        raise UserError(str(error).splitlines()[0]) from error
 
 
 def spin(node: Node, stop: Stop, *companions: Node) -> int:
     """Handle the events of a node, and of others in its process, until it is asked to stop; returns 0.
 
-    The default executors rebuild their wait set at every wake, which costs 18 us per subscription and
-    saturates a core at 50 robots. The EventsExecutor's own `spin()` never returns in Jazzy and delivers
-    nothing, and waiting for a future returns only when nothing is left to do, under overload never.
+    The default executors rebuild their wait set at every wake: 18 us per subscription. The EventsExecutor's
+    `spin()` never returns in Jazzy, and waiting for a future returns only when nothing is left to do.
     """
     executor = EventsExecutor()
     nodes = (node, *companions)
@@ -334,9 +288,8 @@ def spin(node: Node, stop: Stop, *companions: Node) -> int:
 class Ticks:
     """Calls back once per period [s] of a node's clock; missed periods are skipped, never queued.
 
-    In simulated time, ticks are at the multiples of the period. rclpy's timers fail there on a busy machine:
-    for each /clock that finds a timer due, the EventsExecutor queues the timer without bound, each entry
-    advances the timer by a period, and each reset that brings it back queues two more.
+    In simulated time, ticks are at multiples of the period. For each /clock that finds one of rclpy's timers
+    due, the EventsExecutor queues it without bound, and each reset that brings it back queues two more.
     """
 
     def __init__(self, node: Node, period_s: float, on_tick: Callable[[], None]) -> None:
@@ -355,7 +308,6 @@ class Ticks:
 
     @property
     def _number(self) -> int:
-        """Number of the current period."""
         return int(self._node.get_clock().now().nanoseconds) // self._period_ns
 
     def _on_time(self, _jump: object) -> None:
@@ -373,10 +325,7 @@ class Ticks:
 
 
 def drop_negative_clocks() -> None:
-    """Make all nodes of this process drop a /clock before zero, with a warning.
-
-    rclpy's own callback raises an error for such a message, which ends the node.
-    """
+    """Make all nodes of this process drop a /clock before zero; an error of rclpy would end them."""
     take = TimeSource.clock_callback
 
     def checked(source: TimeSource, message: ClockMessage) -> None:
@@ -384,38 +333,32 @@ def drop_negative_clocks() -> None:
         if message.clock.sec >= 0:
             take(source, message)
         elif node is not None:
-            node.get_logger().warning(
-                f"dropped a /clock of {message.clock.sec} s, before zero",
-                throttle_duration_sec=_CLOCK_THROTTLE_S,
-            )
+            said = f"dropped a /clock of {message.clock.sec} s, before zero"
+            node.get_logger().warning(said, throttle_duration_sec=_CLOCK_THROTTLE_S)
 
     TimeSource.clock_callback = checked
 
 
 def end_at_task_errors() -> None:
-    """Make an error in a task of an executor print its traceback and end the process with status 1.
+    """Make an error in a task of an executor, as of ticks and QoS events, end the process with a traceback.
 
-    Ticks in simulated time and QoS events are tasks. The EventsExecutor of Jazzy crashes while it reports
-    such an error, and the error is lost (ros2/rclpy#1641).
+    The EventsExecutor of Jazzy crashes while it reports such an error, which is lost (ros2/rclpy#1641).
     """
-    Task.set_exception = _end
 
+    def end(_task: Task, error: Exception) -> None:
+        traceback.print_exception(error)
+        raise SystemExit(1) from error
 
-def _end(_task: Task, error: Exception) -> None:
-    traceback.print_exception(error)
-    raise SystemExit(1) from error
+    Task.set_exception = end
 
 
 class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
     """A node that reads its parameters when it is configured, and works while it is active.
 
     What a transition has made, attributes as well as publishers, subscriptions and timers, exists until the
-    opposite transition. So an activation starts from scratch. An executor may still handle events that it
-    had queued before: callbacks that need what is gone ask `is_active`. The parameters have the flag
-    `autostart`; arguments as of `ConfiguredNode`.
-
-    Raises:
-        UserError: The parameter `autostart` cannot be used.
+    opposite transition. An executor may still handle events that it had queued before: callbacks that need
+    what is gone ask `is_active`. The parameters have the flag `autostart`; if it cannot be used, the
+    constructor raises UserError.
     """
 
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
@@ -458,12 +401,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
         return self.state == "active"
 
     def autostart(self) -> None:
-        """Configure and activate, unless the parameter says to wait.
-
-        Raises:
-            UserError: A parameter, or a file that it names, cannot be used.
-            ParameterException: A parameter of rclpy cannot be used.
-        """
+        """Configure and activate, unless the parameter says to wait; raises what is wrong with parameters."""
         if not self._starts_itself:
             self.get_logger().info("unconfigured: waiting for a lifecycle manager")
             return

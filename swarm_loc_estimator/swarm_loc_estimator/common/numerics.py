@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 
+Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
+
 
 @cached_njit
 def wrap(angle: float) -> float:
@@ -53,27 +55,21 @@ def direction_of(y: float, x: float) -> float:
 
 
 @cached_njit
-def composed(
-    ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
-) -> tuple[float, float, float]:
+def composed(ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float) -> Pose:
     """The pose b, given in frame a, in the frame that a is given in; heading not wrapped."""
     cos, sin = math.cos(atheta), math.sin(atheta)
     return ax + cos * bx - sin * by, ay + sin * bx + cos * by, atheta + btheta
 
 
 @cached_njit
-def between(
-    ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
-) -> tuple[float, float, float]:
+def between(ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float) -> Pose:
     """The pose b seen from the pose a, both given in one frame; heading not wrapped."""
     cos, sin = math.cos(atheta), math.sin(atheta)
     return cos * (bx - ax) + sin * (by - ay), cos * (by - ay) - sin * (bx - ax), btheta - atheta
 
 
 @cached_njit
-def moved_by_twist(
-    rho_x: float, rho_y: float, phi: float, x: float, y: float, theta: float
-) -> tuple[float, float, float]:
+def moved_by_twist(rho_x: float, rho_y: float, phi: float, x: float, y: float, theta: float) -> Pose:
     """exp(twist) composed with a pose, heading wrapped."""
     if abs(phi) < 1e-4:
         a, b = 1.0 - phi * phi / 6.0, 0.5 * phi
@@ -175,8 +171,7 @@ _LOWER = _LEFT = np.frombuffer(b"L", dtype=np.uint8)
 _RIGHT, _TRANSPOSED, _PLAIN = (np.frombuffer(letter, dtype=np.uint8) for letter in (b"R", b"T", b"N"))
 _PLUS, _MINUS = np.array([1.0]), np.array([-1.0])
 _LEAF = 40  # Maximum number of rows that are passed to LAPACK, which is slow with larger triangles
-_WHOLE, _FIRST, _LAST = 0, 1, 2
-"""Steps of a plan: a small part; what follows from the upper half of a part; from the lower one."""
+_WHOLE, _FIRST, _LAST = 0, 1, 2  # Steps of a plan: a small part; what follows from its upper and lower half
 
 
 def invert_positive(numbers: FloatArray, size: int) -> bool:
@@ -188,7 +183,7 @@ def invert_positive(numbers: FloatArray, size: int) -> bool:
 
 
 def invert_factor(numbers: FloatArray, size: int) -> bool:
-    """Replace a symmetric positive definite matrix (size, size) by the inverse of its Cholesky factor.
+    """Replace a positive definite matrix (size, size) by the inverse of its Cholesky factor.
 
     Only its lower triangle is read and written; for arguments and result see `invert_positive`.
     """
@@ -202,7 +197,6 @@ def _plan(size: int) -> IntArray:
 
 
 def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:
-    """Those of a part on the diagonal."""
     if rows <= _LEAF:
         return [(_WHOLE, begin, rows)]
     half = rows // 2
@@ -212,7 +206,6 @@ def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:
 
 @cached_njit
 def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
-    """Invert a matrix."""
     if not _invert_factor(numbers, size, plan):
         return False
     sizes = np.empty(2, dtype=np.int32)
@@ -252,10 +245,10 @@ def _invert_part(numbers: FloatArray, begin: int, rows: int, size: int, sizes: N
 def _join_halves(
     numbers: FloatArray, begin: int, rows: int, size: int, sizes: NDArray[np.int32], is_first: bool
 ) -> None:
-    """Go on from half of a part on the diagonal.
+    """Go on from half of a part on the diagonal; products take nearly all of the time, LAPACK would solve.
 
     [A .; B D] has the factor [L 0; M N] with M = B L^-T and N N^T = D - M M^T, and that the inverse
-    [L^-1 0; -N^-1 M L^-1 N^-1]: products take nearly all of the time, where LAPACK would solve.
+    [L^-1 0; -N^-1 M L^-1 N^-1].
     """
     half = rows // 2
     last = begin + half * (size + 1)

@@ -1,8 +1,7 @@
 """Parameters with default, unit, range and documentation, and the base class of users' errors.
 
-A frozen dataclass is filled from ROS parameters (`common/node.py`), checks a swarm file
-or the settings, and gives the tables under doc/. A field with the metadata `numbers_of` holds a
-dataclass of numbers, each of which is a parameter; a field with `is_internal` is not a parameter.
+A frozen dataclass is filled from ROS parameters, a description or the settings, and gives the tables under
+doc/. A field with the metadata `numbers_of` holds a dataclass of numbers, each of which is a parameter.
 """
 
 from __future__ import annotations
@@ -100,11 +99,7 @@ class ParameterSpec:
         return self.number.range_text if self.number else ", ".join(self.choices)
 
     def checked(self, value: object) -> Value:
-        """The value, converted to the exact type; an integer is accepted for a float.
-
-        Raises:
-            ParameterError: It has another type or is out of range.
-        """
+        """The value, of the exact type; an integer is converted for a float. Raises ParameterError."""
         if isinstance(self.default, float) and isinstance(value, int) and not isinstance(value, bool):
             value = float(str(value))  # infinite where float(value) overflows
         if isinstance(self.default, tuple) and isinstance(value, list | tuple):

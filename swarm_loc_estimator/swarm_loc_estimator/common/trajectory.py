@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
 DEFAULT_GAP_NS = 500_000_000  # Ground truth is not interpolated over longer gaps than this
 
@@ -36,14 +35,11 @@ class Trajectory:
             raise TrajectoryError("the stamps of a trajectory go back in time.")
 
 
-def interpolate(
-    trajectory: Trajectory, query_ns: IntArray, max_gap_ns: int
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def interpolate(trajectory: Trajectory, query_ns: IntArray, max_gap_ns: int) -> tuple[FloatArray, BoolArray]:
     """Poses of a trajectory at other times (M,), along the arc between neighbours at most `max_gap_ns` apart.
 
-    Returns:
-        (M, 3) poses, NaN if undefined, and (M,) whether they are defined: a trajectory is not extrapolated
-        beyond its ends nor interpolated across longer gaps; at its own stamps it is always defined.
+    Returns poses (M, 3), NaN if undefined, and whether they are defined (M,): there is no extrapolation
+    beyond the ends nor interpolated across longer gaps; at its own stamps it is always defined.
     """
     poses = np.full((len(query_ns), 3), np.nan)
     if len(trajectory.stamp_ns) == 0:
@@ -58,5 +54,5 @@ def interpolate(
     start, end = trajectory.pose[before[between]], trajectory.pose[inside[between]]
     share = (query_ns[between] - trajectory.stamp_ns[before[between]]) / gap_ns[between]
     poses[between] = se2.compose(start, se2.exp(share[:, None] * se2.log(se2.between(start, end))))
-    valid: npt.NDArray[np.bool_] = exact | between
+    valid: BoolArray = exact | between
     return poses, valid

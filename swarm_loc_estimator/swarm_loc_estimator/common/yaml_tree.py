@@ -20,8 +20,7 @@ from swarm_loc_estimator.common.codec import Tree, shown
 from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import UserError
 
-MAX_BYTES = 2_000_000
-"""Larger files are refused [byte]; the file of a thousand robots has a quarter of this size."""
+MAX_BYTES = 2_000_000  # Larger files are refused [byte]; that of a thousand robots has a quarter of it
 
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
@@ -102,11 +101,7 @@ _Representer.add_representer(float, _Representer.represent_float)
 
 
 def read_file(path: Path, most_bytes: int, error_type: type[UserError] = YamlTreeError) -> bytes:
-    """The content of a regular file.
-
-    Raises:
-        error_type: It cannot be read, is no regular file, or is larger than `most_bytes`.
-    """
+    """The content of a regular file of at most `most_bytes`; raises `error_type` if it cannot be read."""
     try:
         if is_regular := path.is_file() or not path.exists():  # opening a pipe would never return
             with path.open("rb") as file:
@@ -121,11 +116,7 @@ def read_file(path: Path, most_bytes: int, error_type: type[UserError] = YamlTre
 
 
 def read_tree(path: Path, error_type: type[UserError] = YamlTreeError, most_bytes: int = MAX_BYTES) -> Tree:
-    """Read a YAML file of at most `most_bytes` as nested dicts, lists and scalars.
-
-    Raises:
-        error_type: It cannot be read, is too large, is not YAML, or has a key twice.
-    """
+    """A YAML file of at most `most_bytes` as dicts, lists and scalars; raises `error_type` if it is none."""
     data = read_file(path, most_bytes, error_type)
     try:
         with warnings.catch_warnings():

@@ -78,8 +78,7 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
 _MIN_SIGHTINGS = 5  # Fewer sightings of an unknown marker are misread ones
 _MIN_SHARE = 0.05  # Smaller shares of dropped readings are not named
 _MIN_ROWS = 20
-_AWAY_M, _TURNED, _AWAY_SIGMAS = 0.1, 0.35, 5.0
-"""Least distance [m] and angle [rad] from a start that are named, and least multiple of its sigmas."""
+_AWAY_M, _TURNED, _AWAY_SIGMAS = 0.1, 0.35, 5.0  # Least ones named [m, rad], and multiple of start sigmas
 _REASONS = MappingProxyType(
     {
         "no_camera": ("sees markers but has no camera in the description", "Describe its camera"),
@@ -115,13 +114,11 @@ _REASONS = MappingProxyType(
 def check_contents(evidence: Evidence) -> Iterator[Finding]:
     """Readings can be used."""
     # markers that nobody describes
-    detected = evidence.rows("detections").detection["id"]
-    ids, counts = np.unique(detected, return_counts=True)
+    ids, counts = np.unique(evidence.rows("detections").detection["id"], return_counts=True)
     is_unknown = ~np.isin(ids, [*evidence.swarm.owner_of]) & (counts >= _MIN_SIGHTINGS)
     ids, counts = ids[is_unknown], counts[is_unknown]
     if ids.size:
-        most = np.argsort(-counts, kind="stable")
-        which = listed([f"{ids[k]} ({counts[k]} times)" for k in most])
+        which = listed([f"{ids[k]} ({counts[k]} times)" for k in np.argsort(-counts, kind="stable")])
         remedy = "Describe them under landmarks, or ids of a robot; survey finds the places of landmarks"
         yield Finding(f"marker {which}", "was seen, but is in no description", remedy)
     # two robots with the same odometry: one driver for two names
@@ -248,20 +245,17 @@ _CONTRADICTED = MappingProxyType(
 
 
 _WINDOW_NS = 6_000_000_000  # Odometry is trusted this long
-_MIN_MOTION_ROWS, _MIN_MOTION_M = 30, 0.03
-"""Least sightings of landmarks, and least spread of places around their means, for a verdict."""
-_MIN_WINDOWS = 4
-"""Least windows for a verdict on scale and yaw: in a window, the drift of odometry is common to all."""
+_MIN_MOTION_ROWS, _MIN_MOTION_M = 30, 0.03  # Least sightings, and spread around means, for a verdict
+_MIN_WINDOWS = 4  # For a verdict on scale and yaw: in a window, the drift of odometry is common to all
 _ROUNDS = 8
 _CLEARER = 0.75  # Residual of a mirrored track over that of the true one, below which the sign is wrong
 _STANDS_M = 1e-4
 _TINY = 1e-12  # Added to B, which is zero without any data
 _SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(30.0), 8.0
-"""Least errors of scale and yaw that are named, and least multiple of their sigma: of 120 s of real robots
-without these errors, one in ten is off by three sigmas, and the worst of 140 by seven."""
+"""Least errors of scale and yaw that are named, and multiple of their sigma: of 120 s of real robots without
+these errors, one in ten is off by three sigmas, and the worst of 140 by seven."""
 _DEGREES, _SLACK = 20.0, 0.3  # Ratios of a wrong gyroscope to wheels from which units or sign are named
-_TURNED_RAD, _SHARE_TURNED = 1.0, 0.5
-"""Least turn by twists for a verdict on headings, and least share of it that these must turn, too."""
+_TURNED_RAD, _SHARE_TURNED = 1.0, 0.5  # Least turn by twists for a verdict, and share of it by headings
 _AHEAD = 0.4  # Least usual share of the optical z axis in the directions of markers
 
 Change = Callable[[FloatArray], FloatArray]
@@ -364,7 +358,6 @@ def check_motion(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _sightings(evidence: Evidence, index: int, robot: Robot) -> _Sightings:
-    """All sightings of landmarks by a robot."""
     rows = evidence.rows("detections")
     ids = [mark.id for mark in evidence.swarm.landmarks]
     mine = (rows.robot == index) & np.isin(rows.detection["id"], ids)

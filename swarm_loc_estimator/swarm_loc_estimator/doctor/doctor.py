@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
 from swarm_loc_estimator.doctor import contents
-from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, Message, decoded
+from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, Message, Wanted, decoded
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.offline.recorded_bag import BagLocalizer, Progress, renamed_topics, same_type
 from swarm_loc_estimator.sensors.inputs import CLOCKS_APART_S, InputTopic, input_topics, kinds
@@ -134,8 +134,7 @@ _CONVERT = MappingProxyType(
 )
 """What to do with other types of messages."""
 _SLOW_S = 0.35  # Longest usual time between two odometry messages [s]
-_PAUSE_S, _SILENT_S = 2.0, 10.0
-"""Shortest pauses that are named: of odometry and gyroscopes, and at the end of detections [s]."""
+_PAUSE_S, _SILENT_S = 2.0, 10.0  # Shortest pauses named: of odometry and gyroscopes, and of detections [s]
 _PERIODIC = ("odometry", "imu", "detections")
 _SOLE = ("swarm/poses",)
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -205,7 +204,6 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _missing(evidence: Evidence, topic: InputTopic, heard: Heard | None, lone: dict[str, Heard]) -> Finding:
-    """An expected topic without messages."""
     if heard is not None and heard.publishers:
         nodes = listed(sorted(one.node for one in heard.publishers))
         return Finding(topic.name, f"has no messages, though {nodes} publishes it", "Look at that node's log")
@@ -262,11 +260,7 @@ _MAX_IMAGES = 20  # Of a topic; what is wrong with one is wrong with all
 
 
 def examine(evidence: Evidence) -> list[Finding]:
-    """All that is wrong, the most basic things first.
-
-    Mounts are those of static transforms where the description says none. What the estimator contradicts
-    often follows from the rest, so it is added only where nothing else is.
-    """
+    """All that is wrong, the most basic things first; contradictions, which often follow, only if alone."""
     mounts = mounts_of(evidence)
     evidence = replace(evidence, swarm=mounts.described())
     remedy = "Correct the one that is wrong; without it in the description, the transform is taken"
@@ -304,14 +298,12 @@ def evidence_of_bag(
     progress: Progress,
     remap: Mapping[str, str] = MappingProxyType({}),
     namespace: str = "",
-    is_wanted: Callable[[str], bool] | None = None,
+    is_wanted: Wanted | None = None,
 ) -> Evidence:
     """The first `seconds` of a bag; `remap` as in `renamed_topics`, `namespace` of the whole swarm or "".
 
-    Messages of types that `is_wanted` selects are kept; without it, those that a check looks at.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    Kept are messages of types that `is_wanted` selects; without it, those that a check looks at. Raises
+    BagError if nothing in the bag can be read, or a topic cannot be mapped.
     """
     known = [topic.name for topic in input_topics(swarm)]
     messages: dict[str, list[Message]] = {}
@@ -330,8 +322,7 @@ def evidence_of_bag(
             progress(min(1.0, reader.progress), "reading")
         heard = {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()}
         topics = {name.removeprefix(f"{namespace.strip('/')}/"): one for name, one in heard.items()}
-        is_cut = end_ns < reader.time_range_ns[1]
-        return Evidence(swarm, topics, remarks=tuple(reader.losses), is_cut=is_cut)
+        return Evidence(swarm, topics, remarks=tuple(reader.losses), is_cut=end_ns < reader.time_range_ns[1])
 
 
 def is_looked_at(message_type: str) -> bool:

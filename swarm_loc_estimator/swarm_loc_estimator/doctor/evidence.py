@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,17 +14,9 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGE, CdrError, decode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.offline.recorded_bag import same_type
+from swarm_loc_estimator.sensors import inputs as sensors
 from swarm_loc_estimator.sensors.imu import TurnRateRows
-from swarm_loc_estimator.sensors.inputs import (
-    SENSORS,
-    Batch,
-    Ingest,
-    InputConverter,
-    InputStatistics,
-    InputTopic,
-    gathered,
-    live_topics,
-)
+from swarm_loc_estimator.sensors.inputs import Ingest, InputTopic
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.ranges import decode_pair
 from swarm_loc_estimator.sensors.sensor import DropCounts
@@ -36,8 +28,10 @@ from swarm_loc_estimator.timeline.settings import Settings
 SETTINGS = Settings()  # Of the estimator
 _TICK_NS = 500_000_000
 _AT_ZERO = 0.05  # Odometry begins at zero if x and y [m] and the heading [rad] are smaller
-_LASTING_TICKS, _LASTING_SHARE = 4, 0.2
-"""Contradictions of fewer ticks, or of a smaller share of all, are not named."""
+_LASTING_TICKS, _LASTING_SHARE = 4, 0.2  # Contradictions of fewer ticks, or smaller shares, are not named
+
+
+Wanted = Callable[[str], bool]  # Whether messages of a type are kept
 
 
 class Finding(NamedTuple):
@@ -96,9 +90,9 @@ class Evidence:
         """Topics that the estimator reads: shared ones where there are messages on them."""
         shared = any(
             topic.kind.is_shared and topic.name in self.topics and self.topics[topic.name].messages
-            for topic in live_topics(self.swarm, shared=True)
+            for topic in sensors.live_topics(self.swarm, shared=True)
         )
-        return live_topics(self.swarm, shared=shared)
+        return sensors.live_topics(self.swarm, shared=shared)
 
     @property
     def end_ns(self) -> int:
@@ -111,14 +105,12 @@ class Evidence:
         return heard if heard is not None and same_type(heard.type, topic.kind.message_type) else None
 
     @cached_property
-    def read(self) -> tuple[list[Batch], list[InputStatistics], Ingest]:
+    def read(self) -> tuple[list[sensors.Batch], list[sensors.InputStatistics], Ingest]:
         """The estimator's inputs, and statistics by topic of `inputs`."""
         ingest = Ingest(self.swarm, topics=self.inputs)
         found = [self.usable(topic) or Heard("") for topic in self.inputs]
         messages = [
-            SerializedMessage(number, data, arrival_ns)
-            for number, heard in enumerate(found)
-            for arrival_ns, data in heard.messages
+            SerializedMessage(k, *one[::-1]) for k, heard in enumerate(found) for one in heard.messages
         ]
         messages.sort(key=lambda one: one.log_ns)
         parts = [*ingest.read(MessageBatch.of(messages))] if messages else []
@@ -130,24 +122,24 @@ class Evidence:
 
     @cached_property
     def _gathered(self) -> dict[str, Any]:
-        return {name: gathered(self.read[0], name) for name in SENSORS}
+        return {name: sensors.gathered(self.read[0], name) for name in sensors.SENSORS}
 
     @cached_property
-    def converted(self) -> tuple[list[Batch], DropCounts]:
+    def converted(self) -> tuple[list[sensors.Batch], DropCounts]:
         """The measurements of all readings, and numbers of readings that cannot be used."""
-        converter = InputConverter(self.swarm, SETTINGS)
+        converter = sensors.InputConverter(self.swarm, SETTINGS)
         return [converter.convert(part) for part in self.read[0]], converter.drops
 
     @cached_property
     def odometry(self) -> OdometryRows:
         """All valid odometry."""
-        rows: OdometryRows = gathered(self.converted[0], "odometry")
+        rows: OdometryRows = sensors.gathered(self.converted[0], "odometry")
         return rows
 
     @cached_property
     def turn_rates(self) -> TurnRateRows:
         """All valid turn rates of gyroscopes."""
-        rows: TurnRateRows = gathered(self.converted[0], "imu")
+        rows: TurnRateRows = sensors.gathered(self.converted[0], "imu")
         return rows
 
     @cached_property

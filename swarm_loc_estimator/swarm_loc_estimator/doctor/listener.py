@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
@@ -17,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from swarm_loc_estimator.common.node import MessageTypeError, message_class
 from swarm_loc_estimator.doctor.doctor import is_looked_at, keep
-from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
+from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher, Wanted
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -28,18 +27,10 @@ _OWN = ("parameter_events", "rosout")
 
 
 class Listener(Node):
-    """Subscribes to the topics of a swarm in a namespace ("": none), and keeps messages of wanted types.
-
-    Arrivals are by /clock if `use_sim_time`.
-    """
+    """Keeps messages of wanted types on topics in a namespace ("": none), with arrivals by its clock."""
 
     def __init__(
-        self,
-        swarm: Swarm,
-        namespace: str = "",
-        is_wanted: Callable[[str], bool] = is_looked_at,
-        *,
-        use_sim_time: bool,
+        self, swarm: Swarm, namespace: str = "", is_wanted: Wanted = is_looked_at, *, use_sim_time: bool
     ) -> None:
         override = Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)
         super().__init__("doctor", namespace=namespace, parameter_overrides=[override])
@@ -81,7 +72,6 @@ class Listener(Node):
         return Evidence(self._swarm, topics, is_live=True)
 
     def _follow_topics(self) -> None:
-        """Subscribe to topics that are new."""
         own = self.get_namespace().rstrip("/")
         for full, types in self.get_topic_names_and_types():
             name = full.removeprefix(f"{own}/").lstrip("/")
@@ -107,7 +97,7 @@ def listen(
     seconds: float,
     progress: Progress,
     namespace: str = "",
-    is_wanted: Callable[[str], bool] = is_looked_at,
+    is_wanted: Wanted = is_looked_at,
     *,
     use_sim_time: bool,
 ) -> Evidence:

@@ -97,27 +97,20 @@ def use_mean(
     noise: FloatArray,
     pair: FloatArray,
 ) -> None:
-    """Replace a measurement of a pair by the information that it adds to the pair's fused information.
+    """Replace measurement k of a pair by the information that it adds to the pair's fused information.
 
-    Args:
-        measurements: (m,).
-        k: Index of the measurement.
-        belief: With the memory of pairs.
-        poses: (2, 3) of observer and target in `map`.
-        predicted: (3,) value predicted from them.
-        variances: (3,) of the predicted value.
-        innovation: (3,) measured minus predicted, changed.
-        noise: (3, 3) covariance of the measurement, changed.
-        pair: (PAIR_ROWS, 3) written: the memory of the pair if the measurement is used.
+    From poses (2, 3) in `map` the value (3,) is predicted with variances (3,). Innovation (3,) and noise (3,
+    3) are changed, and the memory of the pair (PAIR_ROWS, 3) if the measurement is used is written.
     """
     observer, target = measurements.observer[k], measurements.target[k]
     place = _place(belief, observer, target, measurements.systematic_share[k])
     if place < 0:
         return
-    _write_track(belief.transform[observer], poses[0], pair[_OBSERVER])
-    _write_track(belief.transform[target], poses[1], pair[_TARGET])
-    pair[_NOISE, 0] = _gathered(belief.preintegrated_covariance[observer])
-    pair[_NOISE, 1] = _gathered(belief.preintegrated_covariance[target])
+    for side, row in enumerate((_OBSERVER, _TARGET)):  # the poses on the tracks, and their noise
+        robot = observer if side == 0 else target
+        t, pose = belief.transform[robot], poses[side]
+        pair[row, 0], pair[row, 1], pair[row, 2] = between(t[0], t[1], t[2], pose[0], pose[1], pose[2])
+        pair[_NOISE, side] = _gathered(belief.preintegrated_covariance[robot])
     for i in range(3):
         again = min(measurements.systematic_share[k, i], 1.0) * measurements.covariance[k, i, i]
         pair[_RANDOM, i], pair[_SYSTEMATIC, i] = max(noise[i, i] - again, 0.0), again
@@ -135,12 +128,9 @@ def use_mean(
 
 @cached_njit
 def inflate_fix(shares: FloatArray, predicted_covariance: FloatArray, noise: FloatArray) -> None:
-    """Inflate the noise of a fix so that it adds no more than what earlier ones with its errors lack.
+    """Inflate the noise (3, 3) of a fix so that it adds no more than what earlier ones with its errors lack.
 
-    Args:
-        shares: (3,) systematic share of each of its variances.
-        predicted_covariance: (3, 3) of the pose.
-        noise: (3, 3) covariance of the fix, changed.
+    `shares` (3,) are the systematic shares of its variances.
     """
     root = cholesky3(noise)
     inverse = _inverse(root)
@@ -172,22 +162,36 @@ def _join(
     known: FloatArray, predicted: FloatArray, innovation: FloatArray, noise: FloatArray, pair: FloatArray
 ) -> None:
     """Let a measurement join the mean of its pair, see `use_mean`."""
-    carried, stand = _carried(known, pair), _are_stationary(known, pair)
+    # Whether neither robot can have moved since: without odometry, the pose on the track is no evidence.
+    gathered = max(abs(pair[_NOISE, 0] - known[_NOISE, 0]), abs(pair[_NOISE, 1] - known[_NOISE, 1]))
+    stand = gathered < _STATIONARY_SIGMA * _STATIONARY_SIGMA
+    # The mean before, carried here, and how much of its information is left.
+    carried = _carried(known, pair)
     left, fused = _remaining(known, carried, pair[_VARIANCE]), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             fused[i, j] = known[_FUSED + i, j] * math.sqrt(left[i] * left[j])
+    # The weight of the measurement in the mean of each component, w' and s'.
     before = _inverse(fused)
     step, weights = np.zeros(3), 0.0
     for i in range(3):
-        variance = (known[_SYSTEMATIC, i] + known[_RANDOM, i]) / left[i] if stand else before[i, i]
-        weight = _join_component(known, pair, i, variance)
+        systematic, own = known[_SYSTEMATIC, i], pair[_RANDOM, i]
+        variance = (systematic + known[_RANDOM, i]) / left[i] if stand else before[i, i]
+        rest = max(variance - systematic, 0.0)
+        weight = rest / (rest + own) if rest > _NEGLIGIBLE * variance else 0.0
+        root = (1.0 - weight) * math.sqrt(systematic) + weight * math.sqrt(pair[_SYSTEMATIC, i])
+        pair[_RANDOM, i], pair[_SYSTEMATIC, i] = weight * own, root * root
         weights += weight
         if stand:
             step[i] = weight * _difference(i, pair[_MEAN, i], carried[i])
             pair[_MEAN, i] = carried[i] + step[i]
             innovation[i] = _difference(i, pair[_MEAN, i], predicted[i])
-    assign_matrix(noise, _noise_beside(fused, _covariance(before, noise, weights / 3.0, pair)))
+    # The noise whose information, added to what was fused, gives the covariance of the mean; what is fused
+    # then.
+    factor = cholesky3(_covariance(before, noise, weights / 3.0, pair))
+    new, directions = np.linalg.eigh(np.eye(3) - np.dot(factor.T, np.dot(fused, factor)))
+    spread = np.dot(factor, directions) / np.sqrt(np.maximum(new, _NEGLIGIBLE))
+    assign_matrix(noise, np.dot(spread, spread.T))
     _hold_back(noise, pair)
     step = np.dot(noise, np.dot(fused, step))
     fused += _inverse(noise)
@@ -198,17 +202,6 @@ def _join(
 
 
 @cached_njit
-def _join_component(known: FloatArray, pair: FloatArray, i: int, variance: float) -> float:
-    """Weight of a measurement in the mean of component i of the given variance; writes w' and s'."""
-    systematic, own = known[_SYSTEMATIC, i], pair[_RANDOM, i]
-    rest = max(variance - systematic, 0.0)
-    weight = rest / (rest + own) if rest > _NEGLIGIBLE * variance else 0.0
-    root = (1.0 - weight) * math.sqrt(systematic) + weight * math.sqrt(pair[_SYSTEMATIC, i])
-    pair[_RANDOM, i], pair[_SYSTEMATIC, i] = weight * own, root * root
-    return weight
-
-
-@cached_njit
 def _difference(i: int, value: float, other: float) -> float:
     """Difference of component i, a range or an angle."""
     return wrap(value - other) if i > 0 else value - other
@@ -216,14 +209,7 @@ def _difference(i: int, value: float, other: float) -> float:
 
 @cached_njit
 def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of the mean of a pair: variances w + s, and the mean of the correlations.
-
-    Args:
-        before: (3, 3) covariance of the mean before.
-        now: (3, 3) covariance of the measurement that joined it.
-        weight: Weight of the measurement.
-        pair: (PAIR_ROWS, 3) with w and s.
-    """
+    """Covariance (3, 3) of the mean of a pair: variances w + s, and the weighted mean of the correlations."""
     covariance = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -243,16 +229,6 @@ def _hold_back(noise: FloatArray, pair: FloatArray) -> None:
 
 
 @cached_njit
-def _noise_beside(fused: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Noise (3, 3) whose information, added to a fused information (3, 3), gives a covariance (3, 3)."""
-    factor = cholesky3(covariance)
-    new, directions = np.linalg.eigh(np.eye(3) - np.dot(factor.T, np.dot(fused, factor)))
-    root = np.dot(factor, directions) / np.sqrt(np.maximum(new, _NEGLIGIBLE))
-    noise: FloatArray = np.dot(root, root.T)
-    return noise
-
-
-@cached_njit
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Inverse (3, 3), contiguous."""
     inverse = np.empty((3, 3))
@@ -263,33 +239,16 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 @cached_njit
 def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
     """The mean of a pair (3,), predicted by odometry to the present poses of the two robots."""
-    distance, bearing, heading = known[_MEAN, 0], known[_MEAN, 1], known[_MEAN, 2]
-    o, t = _motion(pair[_OBSERVER], known[_OBSERVER]), _motion(known[_TARGET], pair[_TARGET])
-    x, y, theta = composed(
-        o[0], o[1], o[2], distance * math.cos(bearing), distance * math.sin(bearing), heading
-    )
-    x, y, theta = composed(x, y, theta, t[0], t[1], t[2])
+    a, b, c, d = pair[_OBSERVER], known[_OBSERVER], known[_TARGET], pair[_TARGET]
+    x, y, theta = between(a[0], a[1], a[2], b[0], b[1], b[2])
+    distance, bearing = known[_MEAN, 0], known[_MEAN, 1]
+    ahead, aside = distance * math.cos(bearing), distance * math.sin(bearing)
+    x, y, theta = composed(x, y, theta, ahead, aside, known[_MEAN, 2])
+    moved = between(c[0], c[1], c[2], d[0], d[1], d[2])
+    x, y, theta = composed(x, y, theta, moved[0], moved[1], moved[2])
     carried = np.empty(3)
     carried[0], carried[1], carried[2] = math.hypot(x, y), math.atan2(y, x), wrap(theta)
     return carried
-
-
-@cached_njit
-def _are_stationary(known: FloatArray, pair: FloatArray) -> bool:
-    """Whether neither robot can have moved since the pair was last recorded.
-
-    Decided by the accumulated variance: without odometry the pose on the track is no evidence.
-    """
-    gathered = 0.0
-    for i in range(2):
-        gathered = max(gathered, abs(pair[_NOISE, i] - known[_NOISE, i]))
-    return gathered < _STATIONARY_SIGMA * _STATIONARY_SIGMA
-
-
-@cached_njit
-def _motion(start: FloatArray, end: FloatArray) -> tuple[float, float, float]:
-    """The pose `end` (3,) seen from the pose `start` (3,)."""
-    return between(start[0], start[1], start[2], end[0], end[1], end[2])
 
 
 @cached_njit
@@ -305,12 +264,6 @@ def _remaining(known: FloatArray, carried: FloatArray, variances: FloatArray) ->
             left[i] *= known[_VARIANCE, i] / variances[i]
         left[i] = max(left[i], _NEGLIGIBLE)
     return left
-
-
-@cached_njit
-def _write_track(transform: FloatArray, pose: FloatArray, out: FloatArray) -> None:
-    """Write the pose on its track (3,) of a robot with this pose (3,) in `map`."""
-    out[0], out[1], out[2] = between(transform[0], transform[1], transform[2], pose[0], pose[1], pose[2])
 
 
 @inlined_njit
@@ -330,13 +283,7 @@ def record_pair(measurements: Measurements, k: int, belief: BeliefArrays, pair: 
 
 @cached_njit
 def record_constraint(one: Measurements, belief: BeliefArrays, tracks: OdometrySample) -> None:
-    """Store a measurement that may initialize a robot, with correlated initial error.
-
-    Args:
-        one: A row of measurements.
-        belief: Its memory of pairs is changed.
-        tracks: (2,) of observer and target.
-    """
+    """Store a row of measurements that may initialize a robot; `tracks` (2,) are of observer and target."""
     observer: int = one.observer  # type: ignore[assignment]  # of a row, these are scalars
     target: int = one.target  # type: ignore[assignment]
     place = _place(belief, observer, target, one.systematic_share)
@@ -412,17 +359,10 @@ def note_update(
     correction: FloatArray,
     work: Innovations,
 ) -> None:
-    """Update the excess covariances of the robots of measurement k, which was used.
+    """Update the excess covariances of the robots of measurement k, which was used, as is row 0 of `work`.
 
-    What an update by one number leaves follows from its gain, the correction over the innovation.
-
-    Args:
-        measurements: (m,).
-        k: Which one.
-        belief: Just updated; its sources are changed.
-        before: (2, 3, 3) covariances of the errors of observer and target before the update.
-        correction: (n,) of the filter.
-        work: Its measurement, in row 0.
+    `before` (2, 3, 3) are the covariances of observer and target before the correction (n,). What an update
+    by one number leaves follows from its gain, the correction over the innovation.
     """
     sides, innovation = (measurements.observer[k], measurements.target[k]), work.innovation[0, 0]
     left, added = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
@@ -496,18 +436,10 @@ def _take_off_shared(
 def _learn(
     belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray, left: FloatArray, added: FloatArray
 ) -> None:
-    """Write what an update leaves of errors and the noise that it adds.
+    """Write what an update leaves of errors (3, 3), A, and the noise that it adds (3, 3), A (P0 - P).
 
     A is I - K H, where K = (P0 - C) H^T S^-1 and K S K^T = P0 - P; without C, of a known place, P P0^-1.
-    The noise K R K^T that the update adds is then A (P0 - P).
-
-    Args:
-        belief: Just updated.
-        robot: Index of the robot.
-        before: (3, 3) P0.
-        own: (3, 3) P0 - C.
-        left: (3, 3) A, written.
-        added: (3, 3) A (P0 - P), written.
+    `before` (3, 3) is P0, `own` (3, 3) P0 - C.
     """
     difference = before.copy()
     for i in range(3):
@@ -605,17 +537,9 @@ def noise_of_range(
     The errors of two radios depend on where they are. Differences of ranges that follow each other show the
     noise of each; what the description allows beyond it repeats. With the share s of the variance that does,
     n looks from the same places have the information n / (1 + (n - 1) s) of one. It is spent until the
-    antennas move: of errors whose correlation is 1/e at a length, two lengths are one look. What the noise of
-    odometry has made of it since then does not count.
-
-    Args:
-        measurements: (m,).
-        k: Which one.
-        belief: The memory of its link is changed.
-        tracks: Odometry, which alone tells how far both antennas have moved.
-        variance: Of the predicted range [m^2].
-        innovation: Measured minus predicted.
-        accepted: Whether it is used.
+    antennas move, as odometry alone tells: of errors whose correlation is 1/e at a length, two lengths are
+    one look. What the noise of odometry has made of it since then does not count. `variance` is that of the
+    predicted range [m^2].
     """
     robot, source = robot_of(measurements, k), source_of(measurements, k, belief)
     described: float = measurements.covariance[k, 0, 0]
@@ -655,10 +579,6 @@ def noise_of_range(
         news = (looks + 1.0) / (1.0 + looks * repeated) - spent
     noise = described / max(news, _LEAST_NEWS)
     if accepted:
-        last[RANGE_VALUE], last[_INNOVATION], last[_SPENT] = (
-            measurements.value[k, 0],
-            innovation,
-            spent + news,
-        )
-        last[_VARIANCE] = variance * noise / (variance + noise)
+        last[RANGE_VALUE], last[_INNOVATION] = measurements.value[k, 0], innovation
+        last[_SPENT], last[_VARIANCE] = spent + news, variance * noise / (variance + noise)
     return noise

@@ -138,9 +138,8 @@ class DenseFilter:
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
-        other = DenseFilter.__new__(DenseFilter)
-        other.covariance, other.marginal = self.covariance.copy(), self.marginal
-        other.transition = self.transition
+        other = DenseFilter(0)
+        other.covariance = self.covariance.copy()
         return other
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -184,16 +183,10 @@ class DenseFilter:
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
-        """Fuse measurements with independent errors as one batch; return the correction (n,).
+        """Fuse measurements (m,) as one batch, see `JointFilter`; return the correction (n,).
 
         Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
         whose cost does not grow with the number of measurements.
-
-        Args:
-            columns: (m, c) filter columns of each measurement; may contain duplicates.
-            jacobian: (m, r, c) Jacobians; a zero row for a component that was not measured.
-            innovation: (m, r) measured minus predicted.
-            noise: (m, r, r) covariance of the measurement.
         """
         gradient = np.zeros(self.covariance.shape[0])
         information = inverse(self.covariance)
@@ -232,12 +225,8 @@ def link_covariance(
 ) -> FloatArray:
     """Covariance (c, c) of the columns (c,) of a link, of which 6 is the bias of the observer's radio.
 
-    Args:
-        joint: Prepared for an update, if it is sparse.
-        columns: (c,) filter columns; missing ones are arbitrary.
-        bodies: First columns of observer and target; -1: none.
-        radio: Column of that bias; -1: none.
-        cross_covariance: (3, 6) see `JointFilter.prepare_update`.
+    Missing ones are arbitrary. `bodies` are the first columns of observer and target, and `radio` is that of
+    the bias; -1: none. A sparse filter is prepared for an update, and `cross_covariance` (3, 6) is of this.
     """
     if joint.is_dense:
         return joint.block(columns)
@@ -260,18 +249,25 @@ def update_one(
     """Fuse one measurement: update the covariance (n, n) in place, return the correction (n,).
 
     Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, expanded
-    to P - K H P - (P H^T - K S) K^T, where the last term is the rounding error, and made symmetric.
-
-    Args:
-        covariance: (n, n) of all states.
-        columns: (c,) filter columns of the measurement; may contain duplicates.
-        jacobian: (3, c).
-        innovation: (3,) measured minus predicted.
-        noise: (3, 3) covariance of the measurement.
+    to P - K H P - (P H^T - K S) K^T, where the last term is the rounding error, and made symmetric. Columns
+    (c,) may contain duplicates; the Jacobian is (3, c), the innovation (3,), the noise (3, 3).
     """
-    size = covariance.shape[0]
-    ph = _projected(covariance, columns, jacobian)
-    s = innovation_covariance(ph, columns, jacobian, noise)
+    # P H^T (n, 3), and S = H P H^T + R, eq. (13)
+    size, s = covariance.shape[0], np.empty((3, 3))
+    ph = np.zeros((size, 3))
+    for c in range(columns.size):
+        column = columns[c]
+        for r in range(3):
+            slope = jacobian[r, c]
+            if slope != 0.0:
+                for i in range(size):
+                    ph[i, r] += covariance[column, i] * slope
+    assign_matrix(s, noise)
+    for c in range(columns.size):
+        for i in range(3):
+            for j in range(3):
+                s[i, j] += jacobian[i, c] * ph[columns[c], j]
+    # gain K, correction, and change of the covariance
     factor = cholesky3(s)
     gain, one = np.empty((3, size)), np.empty(3)
     change, correction = np.empty((3, size)), np.zeros(size)
@@ -291,32 +287,3 @@ def update_one(
             value += k2 * change[2, j] + c2 * gain[2, j]
             covariance[i, j] -= value
     return correction
-
-
-@cached_njit
-def _projected(covariance: FloatArray, columns: IntArray, jacobian: FloatArray) -> FloatArray:
-    """P H^T (n, 3)."""
-    size = covariance.shape[0]
-    ph = np.zeros((size, 3))
-    for c in range(columns.size):
-        column = columns[c]
-        for r in range(3):
-            factor = jacobian[r, c]
-            if factor != 0.0:
-                for i in range(size):
-                    ph[i, r] += covariance[column, i] * factor
-    return ph
-
-
-@cached_njit
-def innovation_covariance(
-    projected: FloatArray, columns: IntArray, jacobian: FloatArray, noise: FloatArray
-) -> FloatArray:
-    """S = H P H^T + R (3, 3) from P H^T (n, 3); eq. (13)."""
-    s = np.empty((3, 3))
-    assign_matrix(s, noise)
-    for c in range(columns.size):
-        for i in range(3):
-            for j in range(3):
-                s[i, j] += jacobian[i, c] * projected[columns[c], j]
-    return s

@@ -189,6 +189,7 @@ def _direction(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 _XY = ("forward [m]", "left [m]", "heading [rad]")
 _LINE = ("range [m]", "bearing [rad]", "heading [rad]")
+_OFF = ("difference [m]",)
 BEARING, RANGE, RANGE_DIFFERENCE = 4, 10, 11
 
 MODELS: dict[int, MeasurementModel] = {
@@ -201,13 +202,7 @@ MODELS: dict[int, MeasurementModel] = {
         MeasurementModel("bearing", BEARING, ("bearing [rad]",), (True,), 1, _predict_bearing),
         MeasurementModel("range", RANGE, ("range [m]",), (False,), 1, _predict_range, (1.0, 1.0)),
         MeasurementModel(
-            "range difference",
-            RANGE_DIFFERENCE,
-            ("difference [m]",),
-            (False,),
-            1,
-            _predict_difference,
-            (0.0, 1.0),
+            "range difference", RANGE_DIFFERENCE, _OFF, (False,), 1, _predict_difference, (0.0, 1.0)
         ),
     )
 }
@@ -231,8 +226,7 @@ def register(model: MeasurementModel) -> None:
 
 def is_compiled(models: np.typing.NDArray[np.int64]) -> BoolArray:
     """Whether compiled code evaluates measurements of models (m,)."""
-    is_position: BoolArray = (models == CARTESIAN) | (models == POLAR)
-    return is_position
+    return np.isin(models, COMPILED)
 
 
 @inlined_njit
@@ -270,10 +264,8 @@ def predict(
         camera: (m, 3) yaw offset of the sensor, positive to the left [rad], relative error of distances, and
             range offset [m]; zero by default.
     """
-    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 6))
     errors = np.zeros((measurements.size, 3)) if camera is None else camera
-    _predict_all(measurements, observer_pose, target_pose, errors, value, jacobian)
-    return value, jacobian
+    return _predict_all(measurements, observer_pose, target_pose, errors)
 
 
 def predict_any(
@@ -307,17 +299,13 @@ def angles(models: np.typing.NDArray[np.int64]) -> BoolArray:
 
 @cached_njit
 def _predict_all(
-    measurements: Measurements,
-    observer_pose: FloatArray,
-    target_pose: FloatArray,
-    camera: FloatArray,
-    value: FloatArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write `predict` for all measurements."""
-    for k in range(observer_pose.shape[0]):
+    measurements: Measurements, observer_pose: FloatArray, target_pose: FloatArray, camera: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    value, jacobian = np.zeros((len(camera), 3)), np.zeros((len(camera), 3, 6))
+    for k in range(len(camera)):
         errors = (camera[k, 0], camera[k, 1], camera[k, 2])
         predict_one(measurements, k, observer_pose[k], target_pose[k], errors, value[k], jacobian[k])
+    return value, jacobian
 
 
 @inlined_njit
@@ -396,14 +384,10 @@ def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
 def position_distance(
     innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
 ) -> float:
-    """Squared Mahalanobis distance of the position, the first two components.
+    """Squared Mahalanobis distance of the position by an innovation (3,) and its covariance (3, 3).
 
-    The heading of a marker is not gated: the planar ambiguity of a square flips it in good sightings.
-
-    Args:
-        innovation: (3,).
-        covariance: (3, 3) of the innovation.
-        more: Variances added to both components.
+    The heading of a marker is not gated: the planar ambiguity of a square flips it in good sightings. `more`
+    are variances added to both components.
     """
     a, b, d = covariance[0, 0] + more[0], covariance[0, 1], covariance[1, 1] + more[1]
     x, y = innovation[0], innovation[1]

@@ -22,17 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from swarm_loc_estimator.common import numerics
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.numerics import (
-    add_scaled,
-    adjoint_of,
-    assign,
-    assign_matrix,
-    carry,
-    factor_numbers,
-    moved_by_twist,
-)
 from swarm_loc_estimator.filter.state import BeliefArrays, covariance_within, own_column, own_covariance
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
@@ -72,9 +64,9 @@ def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatA
                 whole[first + i, first + j] += scratch[0, i, j]
             else:
                 own[robot, i, j] += scratch[0, i, j]
-    add_scaled(belief.sources.excess[robot], scratch[0], _growth(belief, robot, to.stamp_ns))
-    assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
-    assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
+    numerics.add_scaled(belief.sources.excess[robot], scratch[0], _growth(belief, robot, to.stamp_ns))
+    numerics.assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
+    numerics.assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
     belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
 
 
@@ -87,25 +79,16 @@ def write_predicted(
     transform: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Write the predicted T (3,) and the reported covariance (3, 3) of its error; do not change the belief.
-
-    Args:
-        belief: Belief to predict from.
-        robot: Index of the robot.
-        to: Instant and preintegrated odometry.
-        scratch: From `new_scratch`.
-        transform: (3,) written.
-        covariance: (3, 3) written.
-    """
-    assign(transform, belief.transform[robot])
+    """Write the predicted T (3,) and the reported covariance (3, 3) of its error; keep the belief."""
+    numerics.assign(transform, belief.transform[robot])
     for i in range(3):
         for j in range(3):
             covariance[i, j] = covariance_within(belief, 3 * robot, i, j)
     if _new_noise(belief, robot, to.covariance, scratch):
         if _has_drives(belief, robot):
             _write_drifted(belief, robot, to, transform, covariance)
-        add_scaled(covariance, scratch[0], 1.0 + _growth(belief, robot, to.stamp_ns))
-    add_scaled(covariance, belief.sources.excess[robot], 1.0)
+        numerics.add_scaled(covariance, scratch[0], 1.0 + _growth(belief, robot, to.stamp_ns))
+    numerics.add_scaled(covariance, belief.sources.excess[robot], 1.0)
 
 
 @inlined_njit
@@ -124,17 +107,14 @@ def _write_drifted(
     """Apply the drift to T (3,), and write the covariance (3, 3) of its error."""
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, transform)
-    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
-    count = _own(belief, robot, drift, columns, weight)
-    _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
+    _write_block(belief, robot, drift, covariance)
 
 
 @inlined_njit
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
     """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is positive semidefinite.
 
-    The matrix is not positive semidefinite if odometry from
-    beyond the horizon arrives after a larger dropout noise was assumed.
+    It is not if odometry from beyond the horizon arrives after a larger dropout noise was assumed.
     """
     before, difference, work = belief.preintegrated_covariance[robot], scratch[1], scratch[2]
     rounding = 1e-12
@@ -144,10 +124,10 @@ def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: Flo
         for j in range(3):
             difference[i, j] = noise[i, j] - before[i, j]
             work[i, j] = difference[i, j] + (rounding if i == j else 0.0)
-    first, _, second, _, _, third = factor_numbers(work)
+    first, _, second, _, _, third = numerics.factor_numbers(work)
     if not math.isfinite(first + second + third):
         return False
-    carry(belief.transform[robot], difference, scratch[0])
+    numerics.carry(belief.transform[robot], difference, scratch[0])
     return True
 
 
@@ -170,7 +150,7 @@ def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
     spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
     gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
     out = _Drift(np.zeros(3), np.zeros((3, DRIVES)), left, variance * gained, variance * shared)
-    adjoint, before = adjoint_of(belief.transform[robot]), belief.preintegrated_jacobian[robot]
+    adjoint, before = numerics.adjoint_of(belief.transform[robot]), belief.preintegrated_jacobian[robot]
     for m in range(DRIVES):
         mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
         for i in range(3):
@@ -179,7 +159,7 @@ def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
             out.twist[i] += out.drive[i, m] * belief.parameter[robot, m]
     pose, column = np.zeros(3), np.empty(3)
     _move(0.5 * out.twist, pose)
-    half = adjoint_of(pose)
+    half = numerics.adjoint_of(pose)
     for m in range(DRIVES):
         for i in range(3):
             column[i] = out.drive[i, m]
@@ -189,9 +169,11 @@ def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
 
 
 @cached_njit
-def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, weight: FloatArray) -> int:
-    """Write source columns (3 + DRIVES,) and weights of the pose's error; return their number."""
-    count = 0
+def _write_block(
+    belief: BeliefArrays, robot: int, drift: _Drift, out: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Write the covariance (3, 3) of the pose's error after the drift; return source columns and weights."""
+    columns, weight, count = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES)), 0
     for m in range(3 + DRIVES):
         column = own_column(belief, robot, m)
         if column >= 0:
@@ -199,14 +181,7 @@ def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, wei
             for i in range(3):
                 weight[i, count] = drift.drive[i, m - 3] if m >= 3 else (1.0 if i == m else 0.0)
             count += 1
-    return count
-
-
-@cached_njit
-def _block(
-    p: FloatArray, columns: IntArray, weight: FloatArray, count: int, drift: _Drift, out: FloatArray
-) -> None:
-    """Write the covariance (3, 3) of the pose's error after the drift."""
+    p = own_covariance(belief, robot)
     for i in range(3):
         for j in range(i + 1):
             total = drift.gained * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
@@ -214,6 +189,7 @@ def _block(
                 for b in range(count):
                     total += weight[i, a] * p[columns[a], columns[b]] * weight[j, b]
             out[i, j] = out[j, i] = total
+    return columns[:count], weight
 
 
 @cached_njit
@@ -224,20 +200,23 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     _move(drift.twist, belief.transform[robot])
     first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
     size = p.shape[0]
-    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
     rows, block = np.zeros((3, size)), np.empty((3, 3))
     # Covariances of the pose with all states, F P, and of the pose, F P F^T.
-    count = _own(belief, robot, drift, columns, weight)
-    _block(p, columns, weight, count, drift, block)
+    columns, weight = _write_block(belief, robot, drift, block)
     for i in range(3):
-        for a in range(count):
+        for a in range(columns.size):
             for j in range(size):
                 rows[i, j] += weight[i, a] * p[columns[a], j]
-    if not belief.is_dense:
-        _note_transition(belief, robot, drift)
+    # The transition, for cross-covariances of a sparse filter.
+    for m in range(0 if belief.is_dense else DRIVES):
+        if belief.table.column[robot, m] >= 0:
+            for i in range(3):
+                belief.transition[robot, i, m] += drift.drive[i, m] * belief.transition[robot, 3, m]
     # The turn bias decays, and gains process noise.
     bias = own_column(belief, robot, 3 + TURN_BIAS)
     if bias >= 0:
+        if not belief.is_dense:
+            belief.transition[robot, 3, TURN_BIAS] *= drift.left
         belief.parameter[robot, TURN_BIAS] *= drift.left
         for j in range(size):
             p[bias, j] *= drift.left
@@ -269,19 +248,9 @@ def _sway(belief: BeliefArrays, robot: int, stamp_ns: int) -> None:
 
 
 @cached_njit
-def _note_transition(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
-    """Accumulate the transition of the drift, for cross-covariances of a sparse filter."""
-    transition = belief.transition[robot]
-    for m in range(DRIVES):
-        if belief.table.column[robot, m] >= 0:
-            for i in range(3):
-                transition[i, m] += drift.drive[i, m] * transition[3, m]
-    if belief.table.column[robot, TURN_BIAS] >= 0:
-        transition[3, TURN_BIAS] *= drift.left
-
-
-@cached_njit
 def _move(twist: FloatArray, transform: FloatArray) -> None:
     """Left-multiply a transform (3,) by exp(twist), in place."""
-    x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])
+    x, y, theta = numerics.moved_by_twist(
+        twist[0], twist[1], twist[2], transform[0], transform[1], transform[2]
+    )
     transform[0], transform[1], transform[2] = x, y, theta

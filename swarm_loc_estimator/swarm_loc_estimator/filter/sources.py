@@ -213,15 +213,9 @@ def assess(
 ) -> int:
     """Update the link of measurement k, fault scores and evidence.
 
-    Args:
-        measurements: (m,).
-        k: Which one.
-        belief: Its sources are changed.
-        max_fault_score: Fault score from which a source is contradicted.
-        distance: Squared Mahalanobis distance of its gated components.
-        whitened: The innovation over its standard deviation.
-        share: By how much it counts, see `share_of`.
-        elsewhere: Whether no wrong description explains it.
+    Of the gated components, `distance` is the squared Mahalanobis distance and `whitened` the innovation over
+    its standard deviation. The measurement counts by its share, see `share_of`; `elsewhere`: no wrong
+    description explains it.
 
     Returns:
         The robot, or N + l, that is contradicted now and is to be opened; -1: nobody.
@@ -248,12 +242,15 @@ def assess(
             drift[i] += _FORGETTING * share * (whitened[i] - drift[i])
     repeats = is_link or measurements.systematic_share[k, 0] > 0.0
     mean = drift[0] * drift[0] + (0.0 if is_link else drift[1] * drift[1])
+    # A mean far from zero is no drift of scans in a map, which show errors of earlier scans that saw other
+    # walls (late ones are found by their delay, see `sensors/lidar.py`), nor of fixes that are suspended
+    # while nothing else ties their robot, whose own error lasts.
+    suspended = is_suspended(belief, source, 1.5 * max_fault_score) and not _is_tied(belief, robot, now_ns)
+    stays = is_fix(measurements, k) and (measurements.has_second[k] or suspended)
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > ((2.0 if repeats else 1.0) * _DRIFT) ** 2 and not _is_no_drift(
-        measurements, k, belief, max_fault_score
-    ):
+    elif mean > ((2.0 if repeats else 1.0) * _DRIFT) ** 2 and not stays:
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
@@ -281,11 +278,7 @@ def assess(
 
 @cached_njit
 def _as_good(belief: BeliefArrays, robot: int, guilty: int, now_ns: int) -> int:
-    """The fixed camera that is as credible as a guilty one, with which it disagrees about a robot; -1: none.
-
-    A robot between two cameras does not tell which of both is wrong, as long as the others that the guilty
-    one sees agree with it.
-    """
+    """The camera that contradicts a guilty one about a robot, as long as others agree with that; -1: none."""
     state, rival, agreeing = belief.sources, -1, 0
     if not _sees_robots(belief, guilty):
         return -1
@@ -325,10 +318,7 @@ def _instead(belief: BeliefArrays, robot: int, max_fault_score: float, now_ns: i
 
 @cached_njit
 def _relieve(belief: BeliefArrays, robot: int, place: int, relief: float, now_ns: int) -> None:
-    """Lower evidence and fault scores by a measurement that agrees.
-
-    A fixed camera that is suspect is relieved by robots only that others locate, too.
-    """
+    """Lower evidence and fault scores by what agrees; of a suspect camera if others locate the robot, too."""
     state, others = belief.sources, 0
     source = state.source[robot, place]
     state.evidence[robot, place] = max(0.0, state.evidence[robot, place] - relief)
@@ -392,11 +382,8 @@ def _bad_links(belief: BeliefArrays, node: int, now_ns: int) -> tuple[int, float
 @inlined_njit
 def is_suspended(belief: BeliefArrays, source: int, max_fault_score: float) -> bool:
     """Whether a source is not used: fixes, directions or a fixed camera that the rest contradicts."""
-    aside: bool = (
-        belief.tracked.size <= source < belief.sources.score.size
-        and belief.sources.score[source] >= max_fault_score
-    )
-    return aside
+    score = belief.sources.score
+    return bool(belief.tracked.size <= source < score.size and score[source] >= max_fault_score)
 
 
 @inlined_njit
@@ -524,11 +511,8 @@ def is_uncertain(
 def depends_on_heading(position: float, sideways: tuple[float, float], heading: float, drives: bool) -> bool:
     """Whether much of a position's variance stems from the heading, so that its error lies on an arc.
 
-    Args:
-        position: Variance of x plus that of y [m^2].
-        sideways: Covariances of x and of y with the heading [m rad].
-        heading: Variance of the heading [rad^2].
-        drives: Whether the robot has odometry.
+    `position` is the variance of x plus that of y [m^2], `sideways` their covariances with the heading [m
+    rad], whose variance is `heading` [rad^2]; `drives`: the robot has odometry.
     """
     share = _SHARE_OF_DRIVER if drives else _SHARE_OF_HEADING
     depends: bool = sideways[0] ** 2 + sideways[1] ** 2 > share * position * heading
@@ -577,10 +561,7 @@ def count_gated(
 
 @cached_njit
 def _is_elsewhere_by_radios(belief: BeliefArrays, robot: int) -> bool:
-    """Whether radios deny the pose of a robot: some of its ranges are too long and others too short.
-
-    Walls lengthen ranges, and the bias of its own radio changes all alike: these are faults of radios.
-    """
+    """Whether radios deny a pose by too long and too short ranges; a wall or bias changes all in one way."""
     state, newest_ns, long, short = belief.sources, NEVER_NS // 2, 0, 0
     for begin in (True, False):
         for row in range(belief.tracked.size):
@@ -605,19 +586,6 @@ def _is_tied(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
         recent = now_ns - state.seen_ns[robot, place] < _TIED_NS
         tied = tied or (ties and recent and state.finding[robot, place] == AGREES)
     return tied
-
-
-@inlined_njit
-def _is_no_drift(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
-    """Whether a mean of innovations far from zero is no evidence of a drift of the source of measurement k.
-
-    Scans in a map show errors of earlier scans, which saw other walls; late ones are found by their delay,
-    see `sensors/lidar.py`. While fixes of a robot that nothing else ties are suspended, its own error lasts.
-    """
-    robot = robot_of(measurements, k)
-    suspended = is_suspended(belief, source_of(measurements, k, belief), 1.5 * max_fault_score)
-    alone: bool = suspended and not _is_tied(belief, robot, measurements.stamp_ns[k])
-    return is_fix(measurements, k) and (measurements.has_second[k] or alone)
 
 
 _GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)

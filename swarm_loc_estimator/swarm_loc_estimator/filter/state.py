@@ -114,32 +114,17 @@ class Innovations(NamedTuple):
 @cached_njit
 def new_innovations(count: int, robots: int, sources: int) -> Innovations:
     """Allocate innovations of `count` measurements; `sources` are robots and landmarks."""
-    return Innovations(
-        np.zeros((count, 2, 3)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 6)),
-        np.zeros((count, DEPENDS_ON), dtype=np.int64),
-        np.zeros((count, 3, DEPENDS_ON)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, PAIR_ROWS, 3)),
-        np.zeros(count),
-        np.zeros((count, 2)),
-        np.zeros((count, 2)),
-        np.zeros(count),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count),
-        np.zeros(robots + 1, dtype=np.int64),
-        np.zeros(sources, dtype=np.bool_),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros((3, 6)),
-        np.zeros((3, 3)),
-        np.zeros((3, 3)),
-        np.zeros(3),
-    )
+    motion, innovation = np.zeros((2, count, 3))
+    whitened, place = np.zeros((2, count, 2))
+    distance, share, nis = np.zeros((3, count))
+    elsewhere, misread, accepted = np.zeros((3, count), dtype=np.bool_)
+    predicted, other, variances = np.zeros((3, 3))
+    linear = np.zeros((count, DEPENDS_ON), dtype=np.int64), np.zeros((count, 3, DEPENDS_ON)), innovation
+    update = np.zeros((count, 3, 3)), np.zeros((count, PAIR_ROWS, 3)), distance, whitened, place, share
+    lost = np.zeros(robots + 1, dtype=np.int64), np.zeros(sources, dtype=np.bool_)
+    buffers = predicted, other, np.zeros((3, 6)), np.zeros((3, 3)), np.zeros((3, 3)), variances
+    sides = np.zeros((count, 2, 3)), motion, np.zeros((count, 3, 6))
+    return Innovations(*sides, *linear, *update, elsewhere, misread, accepted, nis, *lost, *buffers)
 
 
 @cached_njit
@@ -173,10 +158,8 @@ def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
     """Element of the covariance of a robot's pose and parameters, indexed as by `own_column`."""
     whole, own = belief.covariance, belief.marginal
     if belief.is_dense:
-        within: float = whole[own_column(belief, robot, i), own_column(belief, robot, j)]
-        return within
-    alone: float = own[robot, i, j]
-    return alone
+        return float(whole[own_column(belief, robot, i), own_column(belief, robot, j)])
+    return float(own[robot, i, j])
 
 
 @inlined_njit
@@ -273,67 +256,51 @@ class SwarmState:
         table: Parameters estimated besides the poses.
         pairs: Maximum number of observed robots per robot with a stored mean.
         joint: A new filter of the table's size; dense by default.
-
-    Attributes:
-        transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
-        parameter: (N, PARAMETERS) see `swarm/calibration_states.py`.
-        landmark: (L, 3) correction of each landmark's surveyed pose, in `map`.
-        filter: Covariance of the errors: columns 3i..3i+2 for the right-invariant pose error of robot i,
-            columns of the table for its parameters and for landmarks.
-        predicted_to_ns: (N,) instant to which the robot is predicted.
-        preintegrated_covariance: (N, 3, 3) of its track at that instant, as is preintegrated_jacobian.
-        tracked: (N,) True if the robot is part of the estimate.
-        start_pending: (N,) True if the robot may still be initialized at its configured start.
-        last_fix_ns: (N,) stamp of the newest accepted landmark sighting or absolute fix.
-        sources: What is known of sources, see `sources.py`.
-        contradicted_ns: (N + L,) last contradiction of each robot and landmark; NEVER_NS if none.
-        is_doubted: Whether the description was contradicted as a whole, see `augment_all`.
-        pair_robot: (N, pairs) robots observed by each robot; -1 for an empty slot.
-        pair_stamp_ns: (N, pairs) stamp of the last measurement of the pair.
-        pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
-        windows: Stored measurements by robot that is not tracked, and whether they are of one degree of
-            freedom (see `initializer.py`).
-        next_attempt_ns: (N, 2) earliest instant of the next attempt to initialize the robot with them.
-        images: Memory of aerial images; None before the first.
-        delays: What is known of the delays of lidars, by robot, see `sensors/lidar.py`.
-        map: The known map of lidars, of `map_search.SearchMap`; None: there is none yet.
-        places: Where robots with lidars that are not located may be in the map, see `map_search.py`.
-        origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
-        frame_moves: How often all poses have moved from a local frame to `map`.
-        meetings: Robots that have met while nobody was located.
-        lost_why: (N,) why the robot was deinitialized last, of `LossReason`; 0: it never was.
-        lost_ns: (N,) stamp of the measurement or command that showed it.
-        losses: (len(LossReason) + 1,) how often robots were deinitialized, by reason.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
-        robots = table.column.shape[0]
+        robots, landmarks = table.column.shape[0], table.survey_column.size
         self._table = table
+        # (N, 3) T, from `map` to the frame of the robot's odometry track
         self.transform: FloatArray = np.zeros((robots, 3))
-        self.parameter: FloatArray = np.zeros((robots, PARAMETERS))
-        landmarks = table.survey_column.size
-        self.landmark: FloatArray = np.zeros((landmarks, 3))
+        self.parameter: FloatArray = np.zeros((robots, PARAMETERS))  # see `swarm/calibration_states.py`
+        self.landmark: FloatArray = np.zeros((landmarks, 3))  # Correction of each surveyed pose, in `map`
+        # Covariance of the errors: columns 3i..3i+2 for the right-invariant pose error of robot i, columns of
+        # the table for its parameters and for landmarks
         self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
         self._set_described_priors()
+        # (N,) instant to which the robot is predicted, and what its track has preintegrated then (N, 3, 3)
         self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
         self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
+        # (N,) whether the robot is part of the estimate, or may still begin at its configured start
         self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
         self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
+        # (N,) stamp of the newest accepted landmark sighting or absolute fix
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.sources = new_sources(robots, landmarks)
+        # (N + L,) last contradiction of each robot and landmark, or of the whole description, see
+        # `augment_all`
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
         self.is_doubted = False
+        # (N, pairs) robots observed by each one, -1: none, when, and the mean, see `correlated_noise.py`
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
-        self.windows: dict[tuple[int, bool], Any] = {}  # of `window.Window`
+        # Measurements (of `window.Window`) by robot that is not tracked, and whether they are of one degree
+        # of freedom, see `initializer.py`; (N, 2) earliest instant of the next attempt to initialize it with
+        # them
+        self.windows: dict[tuple[int, bool], Any] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full((robots, 2), NEVER_NS)
-        self.images: IdentityMemory | None = None
-        self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
-        self.map: Any = None  # of `map_search.SearchMap`
-        self.places: dict[int, Any] = {}  # of `map_search.PossiblePlaces`
+        self.images: IdentityMemory | None = None  # None before the first aerial image
+        self.delays: dict[int, Any] = {}  # Of lidars, by robot, of `lidar.DelayBelief`
+        self.map: Any = None  # Of lidars, of `map_search.SearchMap`; None: there is none yet
+        # Where robots with lidars that are not located may be in it, of `map_search.PossiblePlaces`
+        self.places: dict[int, Any] = {}
+        # Robot whose pose was the origin when a local frame began, see `initializer.py`, how often all poses
+        # have moved from one to `map`, and who has met while nobody was located
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
+        # (N,) why the robot was deinitialized last (0: it never was), by what stamp, and how often by reason
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
         self.lost_ns: IntArray = np.full(robots, NEVER_NS)
         self.losses: IntArray = np.zeros(len(LossReason) + 1, dtype=np.int64)
@@ -377,14 +344,7 @@ class SwarmState:
     def initialize(
         self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: float = 0.0
     ) -> None:
-        """Add the robot to the estimate.
-
-        Args:
-            robot: Its index.
-            initial: Pose of its track.
-            at: Instant and preintegrated odometry of its track.
-            confirmations: Number of sightings that agree with this pose.
-        """
+        """Add a robot to the estimate, with a pose of its track at an instant that sightings confirm."""
         alone = (initial.transform, initial.covariance, at.stamp_ns, at.covariance, at.jacobian)
         self.start(np.array([robot]), Starts(*(np.array([one]) for one in alone)), confirmations)
         others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
@@ -436,13 +396,7 @@ class SwarmState:
         self.sources.excess[:] = 0.0
 
     def deinitialize(self, robot: int, why: LossReason, stamp_ns: int) -> None:
-        """Remove the robot from the estimate until a fix initializes it.
-
-        Args:
-            robot: Its index.
-            why: Reason, for diagnostics.
-            stamp_ns: Stamp of the measurement or command that shows it.
-        """
+        """Remove the robot from the estimate until a fix initializes it; a stamp shows why."""
         if self.tracked[robot]:
             self.lost_why[robot], self.lost_ns[robot] = why, stamp_ns
             self.losses[why] += 1
@@ -453,11 +407,9 @@ class SwarmState:
         self._trust(np.array([robot]), 0.0, np.array([stamp_ns]))
 
     def augment(self, source: int, pose: FloatArray) -> None:
-        """Estimate, or re-estimate, the parameters of a contradicted robot or landmark.
+        """Estimate, or re-estimate, the parameters of a contradicted robot, or landmark (N plus its index).
 
-        Args:
-            source: Index of the robot, or N plus the index of the landmark.
-            pose: (3,) of the robot in `map`; its covariance is widened.
+        The covariance of the robot, at a pose (3,) in `map`, is widened.
         """
         robots = self.tracked.size
         self.sources.score[source] = 0.0
@@ -465,7 +417,11 @@ class SwarmState:
         if source < robots:
             self.sources.evidence[source] = 0.0
         if source >= robots:
-            self._augment_landmark(source - robots)
+            landmark = source - robots
+            is_new = self.landmark_column(landmark) < 0
+            self._use_table(self._table.with_landmark(landmark))
+            change = self.filter.set_prior if is_new else self.filter.add
+            change(self.landmark_column(landmark) + np.arange(3), self._table.reopened[landmark])
             self._doubt_all_that_rest_on(source)
             return
         before = self._table.column[source]
@@ -478,11 +434,7 @@ class SwarmState:
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
     def augment_all(self, poses: FloatArray) -> None:
-        """Reset all parameters to their priors and re-estimate them.
-
-        Args:
-            poses: (N, 3) of the robots in `map`; these means are kept.
-        """
+        """Reset all parameters to their priors and re-estimate them; poses (N, 3) in `map` are kept."""
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
         self.is_doubted = True
         table = self._table
@@ -503,31 +455,14 @@ class SwarmState:
         self.filter.append_columns(table)
         self._table = table
 
-    def _augment_landmark(self, landmark: int) -> None:
-        """Estimate a landmark, or re-estimate it."""
-        is_new = self.landmark_column(landmark) < 0
-        self._use_table(self._table.with_landmark(landmark))
-        columns = self.landmark_column(landmark) + np.arange(3)
-        if is_new:
-            self.filter.set_prior(columns, self._table.reopened[landmark])
-        else:
-            self.filter.add(columns, self._table.reopened[landmark])
-
     def _doubt_all_that_rest_on(self, source: int) -> None:
-        """Let robots that have links with one source only share the error of its place.
-
-        They move with it: right-invariant errors of a common motion are equal.
-        """
+        """Let robots with links to one source alone share the error of its place: they move with it."""
         links = self.sources.source
         only = ((links == source) | (links < 0)).all(axis=1) & (links == source).any(axis=1) & self.tracked
         if only.any() and self.filter.is_dense:
             landmark = source - self.tracked.size
-            columns = np.concatenate(
-                [
-                    robot_columns(np.flatnonzero(only)).reshape(-1),
-                    self.landmark_column(landmark) + np.arange(3),
-                ]
-            )
+            own = robot_columns(np.flatnonzero(only)).reshape(-1)
+            columns = np.concatenate([own, self.landmark_column(landmark) + np.arange(3)])
             bodies = columns.size // 3
             self.filter.add(columns, np.tile(self._table.reopened[landmark], (bodies, bodies)))
 
@@ -569,11 +504,9 @@ class SwarmState:
     def pose_covariances(self) -> FloatArray:
         """Covariances (N, 3, 3) of the pose errors of all robots."""
         if not self.filter.is_dense:
-            alone: FloatArray = self.filter.marginal[: self.tracked.size, :3, :3].copy()
-            return alone
+            return np.array(self.filter.marginal[: self.tracked.size, :3, :3])
         columns = robot_columns(np.arange(self.tracked.size))
-        whole: FloatArray = self.filter.covariance[columns[:, :, None], columns[:, None, :]]
-        return whole
+        return np.asarray(self.filter.covariance[columns[:, :, None], columns[:, None, :]])
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero if not estimated."""

@@ -27,68 +27,20 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.correlated_noise import (
-    inflate_fix,
-    noise_of_range,
-    note_update,
-    record_pair,
-    use_mean,
-)
+from swarm_loc_estimator.filter import correlated_noise, models, sources
 from swarm_loc_estimator.filter.joint_filter import JointFilter, link_covariance, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
-from swarm_loc_estimator.filter.models import (
-    CARTESIAN,
-    MODELS,
-    NO_HEADING,
-    POLAR,
-    POSE_GATE,
-    has_kernel,
-    is_misread,
-    position_distance,
-    predict_one,
-    soften_heading,
-    squared_distance,
-    write_innovation,
-)
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
-from swarm_loc_estimator.filter.sources import (
-    LEAST_SHARE,
-    OCCUPIED_M,
-    LossLimits,
-    assess,
-    assess_direction,
-    confirm,
-    count_gated,
-    direction_of,
-    find_link,
-    is_elsewhere,
-    is_excluded,
-    is_fix,
-    is_suspended,
-    is_uncertain,
-    robot_of,
-    share_of,
-    small_variances,
-    source_of,
-)
 from swarm_loc_estimator.filter.state import (
     BeliefArrays,
     Innovations,
     correct,
     covariance_within,
-    new_innovations,
     own_within,
     to_map,
 )
+from swarm_loc_estimator.odometry import track_arrays
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.track_arrays import (
-    OdometrySample,
-    TrackArrays,
-    look_up,
-    look_up_pose,
-    new_sample,
-    rate_at,
-)
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_OFFSET,
     CAMERA_SCALE,
@@ -109,52 +61,29 @@ correct. It is resumed at EVALUATE, ATTRIBUTE and SETTLE."""
 
 
 @cached_njit
-def fuse_in_order(
-    measurements: Measurements,
-    begin: int,
-    tracks: TrackArrays,
-    belief: BeliefArrays,
-    limits: LossLimits,
-    verdicts: NDArray[np.uint8],
-    nis: FloatArray,
-) -> tuple[int, int, int, int]:
-    """Fuse measurements one by one, each at its exact stamp, from `begin` on; see `fuse`."""
-    work = new_innovations(1, belief.tracked.size, belief.sources.score.size)
-    return fuse(measurements, begin, PREDICT, -1, tracks, belief, limits, work, verdicts, nis)
-
-
-@cached_njit
 def fuse(
     measurements: Measurements,
     begin: int,
     stage: int,
     together_ns: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
-    limits: LossLimits,
+    limits: sources.LossLimits,
     work: Innovations,
     verdicts: NDArray[np.uint8],
     nis: FloatArray,
 ) -> tuple[int, int, int, int]:
-    """Fuse measurements from `begin` on, one by one or all together.
+    """Fuse measurements (m,), sorted by stamp, from `begin` and a stage on; see the module.
 
-    Args:
-        measurements: (m,) sorted by stamp; together: between localized robots.
-        begin: Index of the first measurement to fuse.
-        stage: Stage at which to begin or resume.
-        together_ns: Instant to which robots are predicted for all measurements together; -1: one by one.
-        tracks: Odometry.
-        belief: Updated in place.
-        limits: Thresholds beyond which a robot is lost.
-        work: Of one measurement, or of all (m,) together; `lost` and `contradicted` are for these only.
-        verdicts: (m,) written.
-        nis: (m,) normalized innovation squared, written.
+    All robots are predicted to `together_ns` for all measurements, which are between localized robots; with
+    -1 one by one. `work` has one row, or one for each measurement; `lost` and `contradicted` are for the
+    latter. The belief, verdicts (m,) and normalized innovations squared (m,) are written.
 
     Returns:
         Index of the measurement at which it returns, why, the robot or landmark concerned, and why a robot is
         lost (`LossReason`).
     """
-    together, sample, scratch = together_ns >= 0, new_sample(2), new_scratch()
+    together, sample, scratch = together_ns >= 0, track_arrays.new_sample(2), new_scratch()
     k = begin
     while k < measurements.stamp_ns.size:
         end = measurements.stamp_ns.size if together else k + 1
@@ -173,7 +102,7 @@ def fuse(
             # 2. Innovation. 3. Gate, second solution, heading.
             links = False
             for i in range(k, end):
-                if has_kernel(measurements, i):
+                if models.has_kernel(measurements, i):
                     _evaluate(measurements, i, belief, limits, work, i - k)
                 else:
                     links = True
@@ -186,21 +115,21 @@ def fuse(
                 whitened = (work.whitened[row, 0], work.whitened[row, 1])
                 distance, share, limit = work.distance[row], work.share[row], limits.max_fault_score
                 elsewhere = work.elsewhere[row]
-                source = assess(measurements, i, belief, limit, distance, whitened, share, elsewhere)
+                source = sources.assess(measurements, i, belief, limit, distance, whitened, share, elsewhere)
                 if source >= 0 and not together:
                     return k, CONTRADICTED, source, 0
                 if source >= 0:
                     work.contradicted[source] = True
                 if measurements.observer[i] < 0 and measurements.has_heading[i] and work.accepted[row]:
-                    assess_direction(belief, measurements.target[i], work.misread[row], share, limit)
-                place = find_link(measurements, i, belief)
-                if not has_kernel(measurements, i) and place >= 0:
-                    scale = 1.0 + belief.sources.evidence[robot_of(measurements, i), place]
+                    sources.assess_direction(belief, measurements.target[i], work.misread[row], share, limit)
+                place = sources.find_link(measurements, i, belief)
+                if not models.has_kernel(measurements, i) and place >= 0:
+                    scale = 1.0 + belief.sources.evidence[sources.robot_of(measurements, i), place]
                     work.noise[row] *= scale
-                excluded = is_excluded(measurements, i, belief, limit)
+                excluded = sources.is_excluded(measurements, i, belief, limit)
                 work.accepted[row] = work.accepted[row] and not excluded
-                if is_fix(measurements, i) and not work.accepted[row]:
-                    fixes, score = source_of(measurements, i, belief), belief.sources.score
+                if sources.is_fix(measurements, i) and not work.accepted[row]:
+                    fixes, score = sources.source_of(measurements, i, belief), belief.sources.score
                     if _is_occupied(measurements, i, tracks, belief):
                         score[fixes] = 2.0 * limit
                     # Fixes that are wrong for long, or were sought near the pose, do not refute it.
@@ -210,27 +139,33 @@ def fuse(
             # 5. Confirm assumed poses, or refute them; a link does not refute.
             for i in range(k, end):
                 row = i - k
-                if work.accepted[row] or has_kernel(measurements, i):
-                    robot = confirm(measurements, i, belief, work.accepted[row])
+                if work.accepted[row] or models.has_kernel(measurements, i):
+                    robot = sources.confirm(measurements, i, belief, work.accepted[row])
                     if robot >= 0 and not together:
                         return k, LOST, robot, _REFUTED
                     if robot >= 0:
                         work.lost[robot] = _REFUTED
             # 6. Correct.
             for i in range(k, end):
-                if work.accepted[i - k] and has_kernel(measurements, i):
-                    record_pair(measurements, i, belief, work.pair[i - k])
+                if work.accepted[i - k] and models.has_kernel(measurements, i):
+                    correlated_noise.record_pair(measurements, i, belief, work.pair[i - k])
             if together:
                 return k, CORRECTS, -1, 0
             if work.accepted[0]:
                 columns, jacobian, noise = work.columns[0], work.jacobian[0], work.noise[0]
-                before = _covariances(measurements, k, belief)
+                before = np.empty((2, 3, 3))  # covariances of observer and target
+                for side, robot in enumerate((measurements.observer[k], measurements.target[k])):
+                    for i in range(3):
+                        for j in range(3):
+                            before[side, i, j] = covariance_within(belief, 3 * max(robot, 0), i, j)
                 correction = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
                 correct(belief, correction)
-                note_update(measurements, k, belief, before, correction, work)
+                correlated_noise.note_update(measurements, k, belief, before, correction, work)
         # 7. Count gated measurements.
         for i in range(k, end):
-            robot, why = count_gated(measurements, i, belief, work.accepted[i - k], work.share[i - k], limits)
+            robot, why = sources.count_gated(
+                measurements, i, belief, work.accepted[i - k], work.share[i - k], limits
+            )
             if robot >= 0 and not together:
                 return k, LOST, robot, why
             if robot >= 0 and work.lost[robot] == 0:
@@ -243,11 +178,11 @@ def fuse(
 def _predict_one(
     measurements: Measurements,
     k: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
-    limits: LossLimits,
+    limits: sources.LossLimits,
     work: Innovations,
-    sample: OdometrySample,
+    sample: track_arrays.OdometrySample,
     scratch: FloatArray,
 ) -> int:
     """Predict the sides of measurement k to its stamp; return a robot that is too uncertain, or -1."""
@@ -255,14 +190,14 @@ def _predict_one(
     sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):
         if sides[i] >= 0:
-            look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
+            track_arrays.look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
             to = Preintegrated(measurements.stamp_ns[k], sample.covariance[i], sample.jacobian[i])
             predict(belief, sides[i], to, scratch)
             assign(pose[i], sample.pose[i])
             to_map(belief, sides[i], pose[i])
             drives = not tracks.is_stationary[sides[i]]
-            by_axes = i == 0 and measurements.model[k] == CARTESIAN
-            if is_uncertain(belief, sides[i], pose[i], limits, drives, by_axes):
+            by_axes = i == 0 and measurements.model[k] == models.CARTESIAN
+            if sources.is_uncertain(belief, sides[i], pose[i], limits, drives, by_axes):
                 lost: int = sides[i]
                 return lost
     _write_surveyed(measurements, k, belief, pose)
@@ -271,15 +206,17 @@ def _predict_one(
 
 
 @cached_njit
-def _is_occupied(measurements: Measurements, k: int, tracks: TrackArrays, belief: BeliefArrays) -> bool:
+def _is_occupied(
+    measurements: Measurements, k: int, tracks: track_arrays.TrackArrays, belief: BeliefArrays
+) -> bool:
     """Whether fix k puts its robot where another one is: the bodies of a motion capture are exchanged."""
     pose = np.empty(3)
     for robot in range(belief.tracked.size):
         if belief.tracked[robot] and robot != measurements.target[k]:
-            look_up_pose(tracks, robot, measurements.stamp_ns[k], pose)
+            track_arrays.look_up_pose(tracks, robot, measurements.stamp_ns[k], pose)
             to_map(belief, robot, pose)
             x, y = pose[0] - measurements.value[k, 0], pose[1] - measurements.value[k, 1]
-            if math.hypot(x, y) < OCCUPIED_M:
+            if math.hypot(x, y) < sources.OCCUPIED_M:
                 return True
     return False
 
@@ -294,25 +231,14 @@ def _write_surveyed(measurements: Measurements, k: int, belief: BeliefArrays, po
 
 
 @cached_njit
-def _covariances(measurements: Measurements, k: int, belief: BeliefArrays) -> FloatArray:
-    """Covariances (2, 3, 3) of the errors of observer and target of measurement k; undefined for others."""
-    sides, out = (measurements.observer[k], measurements.target[k]), np.empty((2, 3, 3))
-    for side in range(2):
-        for i in range(3):
-            for j in range(3):
-                out[side, i, j] = covariance_within(belief, 3 * max(sides[side], 0), i, j)
-    return out
-
-
-@cached_njit
 def _predict_together(
     measurements: Measurements,
     stamp_ns: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
-    limits: LossLimits,
+    limits: sources.LossLimits,
     work: Innovations,
-    sample: OdometrySample,
+    sample: track_arrays.OdometrySample,
     scratch: FloatArray,
 ) -> None:
     """Predict every involved robot to one instant, and compute poses at the stamps of measurements (m,).
@@ -324,7 +250,7 @@ def _predict_together(
         for robot in (measurements.observer[k], measurements.target[k]):
             if robot >= 0 and not involved[robot]:
                 involved[robot] = True
-                look_up(tracks, robot, stamp_ns, sample, 0)
+                track_arrays.look_up(tracks, robot, stamp_ns, sample, 0)
                 to = Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
                 predict(belief, robot, to, scratch)
     for k in range(measurements.stamp_ns.size):
@@ -335,9 +261,9 @@ def _predict_together(
 def _write_poses(
     measurements: Measurements,
     k: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
-    limits: LossLimits,
+    limits: sources.LossLimits,
     work: Innovations,
 ) -> None:
     """Write poses and motion of measurement k, from the predicted belief."""
@@ -345,26 +271,18 @@ def _write_poses(
     for i in range(2):
         if sides[i] >= 0:
             pose = work.pose[k, i]
-            if _is_of_same_image(measurements, k, i):
-                assign(pose, work.pose[k - 1, i])
+            is_after_another = i == 0 and k > 0 and sides[0] == measurements.observer[k - 1]
+            if is_after_another and measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]:  # of one image
+                assign(pose, work.pose[k - 1, 0])
                 continue
-            look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
+            track_arrays.look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
             to_map(belief, sides[i], pose)
             drives = not tracks.is_stationary[sides[i]]
-            by_axes = i == 0 and measurements.model[k] == CARTESIAN
-            if is_uncertain(belief, sides[i], pose, limits, drives, by_axes):
+            by_axes = i == 0 and measurements.model[k] == models.CARTESIAN
+            if sources.is_uncertain(belief, sides[i], pose, limits, drives, by_axes):
                 work.lost[sides[i]] = _UNCERTAIN
     _write_surveyed(measurements, k, belief, work.pose[k])
     relative_motion(measurements, k, tracks, work.pose[k], work.motion[k])
-
-
-@inlined_njit
-def _is_of_same_image(measurements: Measurements, k: int, side: int) -> bool:
-    """Whether measurement k - 1 has the same observer and stamp, so that its look-up can be reused."""
-    if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
-        return False
-    same: bool = measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
-    return same
 
 
 @cached_njit
@@ -374,7 +292,7 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
     for k in range(columns.shape[0]):
         columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
         columns[k, 2] = -1
-        camera = has_kernel(measurements, k)
+        camera = models.has_kernel(measurements, k)
         for m in range(CAMERA_YAW if camera else RADIO_BIAS, RADIO_BIAS if camera else PARAMETERS):
             column = belief.table.column[max(measurements.observer[k], 0), m]
             if measurements.observer[k] >= 0 and column >= 0:
@@ -384,85 +302,111 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
 
 @inlined_njit
 def _evaluate(
-    measurements: Measurements, k: int, belief: BeliefArrays, limits: LossLimits, work: Innovations, row: int
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    limits: sources.LossLimits,
+    work: Innovations,
+    row: int,
 ) -> None:
     """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
     pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]
     bodies = body_columns(measurements, k, belief)
-    camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, value_jacobian = work.predicted, work.value_jacobian
+    predicted, slopes = work.predicted, work.value_jacobian
     s, variances = work.innovation_covariance, work.variances
-    # Linearize: predicted value, Jacobian, noise.
-    predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
-    _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
+    # Linearize: predicted value, and its Jacobian by both sides and by the observer's camera.
+    camera, of_camera, observer = (0.0, 0.0, 0.0), (-1, -1, -1), measurements.observer[k]
+    if observer >= 0:
+        own, column = belief.parameter[observer], belief.table.column[observer]
+        camera = (own[CAMERA_YAW], own[CAMERA_SCALE], own[CAMERA_OFFSET])
+        of_camera = (column[CAMERA_YAW], column[CAMERA_SCALE], column[CAMERA_OFFSET])
+    models.predict_one(measurements, k, pose[0], pose[1], camera, predicted, slopes)
+    for j in range(3):  # missing columns are arbitrary: their Jacobian is zero
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
+        columns[6 + j] = max(of_camera[j], 0)
+        for i in range(3):
+            jacobian[i, j] = -slopes[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = slopes[i, j] if bodies[1] >= 0 else 0.0
+            jacobian[i, 6 + j] = slopes[i, 3 + j] if of_camera[j] >= 0 else 0.0
+    # Noise, with that of the stamp at this rate of change.
     assign_matrix(noise, measurements.covariance[k])
     of_stamp = measurements.stamp_variance[k]
     if of_stamp > 0.0:
-        _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
-    polar = measurements.model[k] == POLAR
+        change = _times(slopes, 0, motion), _times(slopes, 1, motion), _times(slopes, 2, motion)
+        for i in range(3):
+            for j in range(3):
+                noise[i, j] += of_stamp * change[i] * change[j]
+    polar = measurements.model[k] == models.POLAR
     work.place[row, 0] = predicted[0] * math.cos(predicted[1]) if polar else predicted[0]
     work.place[row, 1] = predicted[0] * math.sin(predicted[1]) if polar else predicted[1]
     # Covariance of the innovation, S = H P H^T + R, eq. (13).
     assign_matrix(s, noise)
-    if belief.is_dense:
-        _read_cross_covariance(belief.covariance, bodies, camera_columns, work.cross_covariance[row])
-    cross, relative = work.cross_covariance[row], work.relative_covariance
-    _add_uncertainty(belief, bodies, camera_columns, value_jacobian, cross, relative, s)
+    cross, relative, p = work.cross_covariance[row], work.relative_covariance, belief.covariance
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    if belief.is_dense:  # undefined if a side is missing
+        for i in range(3):
+            for j in range(3):
+                cross[i, j], cross[i, 3 + j] = p[o + i, t + j], p[t + i, max(of_camera[j], 0)]
+    _add_uncertainty(belief, bodies, of_camera, slopes, cross, relative, s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
     # Innovation, eq. (11), of the likelier solution.
-    write_innovation(measurements, k, measurements.value[k], predicted, innovation)
+    models.write_innovation(measurements, k, measurements.value[k], predicted, innovation)
     if measurements.has_second[k]:
         other = work.other
-        write_innovation(measurements, k, measurements.second[k], predicted, other)
-        if squared_distance(other, s) < squared_distance(innovation, s):
+        models.write_innovation(measurements, k, measurements.second[k], predicted, other)
+        if models.squared_distance(other, s) < models.squared_distance(innovation, s):
             assign(innovation, other)
     # Gate.
-    work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
-    small = small_variances(measurements, k, predicted)
-    work.distance[row] = position_distance(innovation, s, small)
+    work.accepted[row] = models.position_distance(innovation, s) <= measurements.gate[k]
+    small = sources.small_variances(measurements, k, predicted)
+    work.distance[row] = models.position_distance(innovation, s, small)
     x, y = innovation[0] / math.sqrt(s[0, 0] + small[0]), innovation[1] / math.sqrt(s[1, 1] + small[1])
-    if is_fix(measurements, k):  # late fixes err along the path
+    if sources.is_fix(measurements, k):  # late fixes err along the path
         cos, sin = math.cos(pose[1, 2]), math.sin(pose[1, 2])
         x, y = cos * x + sin * y, cos * y - sin * x
     work.whitened[row, 0], work.whitened[row, 1] = x, y
-    work.elsewhere[row] = is_elsewhere(measurements, k, innovation, predicted)
-    work.share[row] = share_of(measurements, k, belief)
+    work.elsewhere[row] = sources.is_elsewhere(measurements, k, innovation, predicted)
+    work.share[row] = sources.share_of(measurements, k, belief)
     if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:
-        work.nis[row] = squared_distance(innovation, s)
-        work.accepted[row] = work.nis[row] <= POSE_GATE
+        work.nis[row] = models.squared_distance(innovation, s)
+        work.accepted[row] = work.nis[row] <= models.POSE_GATE
         s -= noise
-        inflate_fix(measurements.systematic_share[k], s, noise)
+        correlated_noise.inflate_fix(measurements.systematic_share[k], s, noise)
         return
     # A heading that may be flipped or misread counts less.
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])
-        misread = measurements.observer[k] < 0 and is_misread(innovation[2], s[2, 2], measurements.gate[k])
+        misread = measurements.observer[k] < 0 and models.is_misread(
+            innovation[2], s[2, 2], measurements.gate[k]
+        )
         work.misread[row] = misread
-        direction = direction_of(belief, max(measurements.target[k], 0))
+        direction = sources.direction_of(belief, max(measurements.target[k], 0))
         if misread or (
-            measurements.observer[k] < 0 and is_suspended(belief, direction, limits.max_fault_score)
+            measurements.observer[k] < 0 and sources.is_suspended(belief, direction, limits.max_fault_score)
         ):
             noise[0, 2] = noise[1, 2] = noise[2, 0] = noise[2, 1] = 0.0
-            noise[2, 2] = NO_HEADING
+            noise[2, 2] = models.NO_HEADING
         else:
-            soften_heading(innovation, s, noise)
+            models.soften_heading(innovation, s, noise)
         for i in range(3):
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
-    work.nis[row] = squared_distance(innovation, s)
+    work.nis[row] = models.squared_distance(innovation, s)
     # Looks that follow each other closely share their errors; so do repeated exchanges of a pair.
     noise /= work.share[row]
-    use_mean(measurements, k, belief, pose, predicted, variances, innovation, noise, work.pair[row])
+    correlated_noise.use_mean(
+        measurements, k, belief, pose, predicted, variances, innovation, noise, work.pair[row]
+    )
 
 
 @inlined_njit
 def relative_motion(
     measurements: Measurements,
     k: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     pose: FloatArray,
     motion: FloatArray,
 ) -> None:
@@ -476,64 +420,19 @@ def relative_motion(
     sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):
         if sides[i] >= 0:
-            rate = rate_at(tracks, sides[i], measurements.stamp_ns[k])
-            cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
-            # the body's own velocity, seen from the origin of map
-            motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
-            motion[1] += sign * (sin * rate[0] + cos * rate[1] - rate[2] * pose[i, 0])
-            motion[2] += sign * rate[2]
+            x, y, turn = _driven(tracks, sides[i], measurements.stamp_ns[k], pose[i])
+            sign = 2.0 * i - 1.0
+            motion[0], motion[1], motion[2] = (
+                motion[0] + sign * x,
+                motion[1] + sign * y,
+                motion[2] + sign * turn,
+            )
 
 
 @inlined_njit
-def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
-    """Yaw, scale and range offset of an observer's camera, and their filter columns; -1: not estimated."""
-    if observer < 0:
-        return (0.0, 0.0, 0.0), (-1, -1, -1)
-    parameter, column = belief.parameter, belief.table.column
-    yaw, scale, offset = CAMERA_YAW, CAMERA_SCALE, CAMERA_OFFSET
-    return (
-        (parameter[observer, yaw], parameter[observer, scale], parameter[observer, offset]),
-        (column[observer, yaw], column[observer, scale], column[observer, offset]),
-    )
-
-
-@inlined_njit
-def _write_jacobian(
-    value_jacobian: FloatArray,
-    bodies: tuple[int, int],
-    camera_columns: tuple[int, int, int],
-    columns: IntArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write the Jacobian of an innovation (3, DEPENDS_ON) and its filter columns (DEPENDS_ON,).
-
-    Missing columns are arbitrary: their Jacobian is zero.
-    """
-    for j in range(3):
-        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
-        for i in range(3):
-            jacobian[i, j] = -value_jacobian[i, j] if bodies[0] >= 0 else 0.0
-            jacobian[i, 3 + j] = value_jacobian[i, j] if bodies[1] >= 0 else 0.0
-    for j in range(3):
-        columns[6 + j] = max(camera_columns[j], 0)
-        for i in range(3):
-            jacobian[i, 6 + j] = value_jacobian[i, 3 + j] if camera_columns[j] >= 0 else 0.0
-
-
-@inlined_njit
-def _add_stamp_noise(
-    value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
-) -> None:
-    """Add the covariance due to the stamp's variance [s^2] at the rate `motion` (3,) to `noise` (3, 3)."""
-    h, (x, y, turn) = value_jacobian, (motion[0], motion[1], motion[2])
-    change = (
-        h[0, 0] * x + h[0, 1] * y + h[0, 2] * turn,
-        h[1, 0] * x + h[1, 1] * y + h[1, 2] * turn,
-        h[2, 0] * x + h[2, 1] * y + h[2, 2] * turn,
-    )
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] += variance * change[i] * change[j]
+def _times(slopes: FloatArray, row: int, motion: FloatArray) -> float:
+    """The product of the first three columns of a row of `slopes` and a vector (3,)."""
+    return float(slopes[row, 0] * motion[0] + slopes[row, 1] * motion[1] + slopes[row, 2] * motion[2])
 
 
 @inlined_njit
@@ -550,19 +449,6 @@ def body_columns(measurements: Measurements, k: int, belief: BeliefArrays) -> tu
 
 
 @inlined_njit
-def _read_cross_covariance(
-    p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int, int], out: FloatArray
-) -> None:
-    """Write `cross_covariance` (3, 6) of one measurement; undefined if a side is missing."""
-    o, t = max(bodies[0], 0), max(bodies[1], 0)
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = p[o + i, t + j]
-        for k in range(3):
-            out[i, 3 + k] = p[t + i, max(camera[k], 0)]
-
-
-@inlined_njit
 def _add_uncertainty(
     belief: BeliefArrays,
     bodies: tuple[int, int],
@@ -575,7 +461,7 @@ def _add_uncertainty(
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
 
     The covariance of xi_target - xi_observer is computed first, in `relative` (3, 3), which saves two thirds
-    of the work. Columns of bodies and of the camera's parameters are -1 where there are none.
+    of the work.
     """
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
@@ -619,7 +505,7 @@ def _turned(value_jacobian: FloatArray, row: int, matrix: FloatArray) -> tuple[f
 def evaluate_link(
     one: Measurements,
     k: int,
-    tracks: TrackArrays,
+    tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
     joint: JointFilter,
     work: Innovations,
@@ -630,7 +516,7 @@ def evaluate_link(
     rows and unit noise.
     """
     # Predict.
-    model, stamp_ns = MODELS[int(one.model)], int(one.stamp_ns)
+    model, stamp_ns = models.MODELS[int(one.model)], int(one.stamp_ns)
     predicted = model.predicted(one, work.pose[k, 0], work.pose[k, 1])
     count, sides, row = predicted.value.size, (int(one.observer), int(one.target)), one.columns()
     columns = body_columns(row, 0, belief)
@@ -643,7 +529,7 @@ def evaluate_link(
             body = slice(3 * i, 3 * i + 3)
             work.columns[k, body], work.jacobian[k, :count, body] = columns[i] + np.arange(3), jacobian
         if sides[i] >= 0:
-            slope += jacobian @ _motion(tracks, sides[i], stamp_ns, work.pose[k, i])
+            slope += jacobian @ np.array(_driven(tracks, sides[i], stamp_ns, work.pose[k, i]))
     noise += one.stamp_variance * np.outer(slope, slope)
     # Biases of radios; a sparse filter has that of the observer only, as of a camera.
     bias, radios = _write_radios(one, belief, work.columns[k], work.jacobian[k])
@@ -654,7 +540,7 @@ def evaluate_link(
     s = jacobian @ covariance @ jacobian.T + noise
     innovation = model.innovation(one.value, predicted.value + bias)
     gated = slice(model.gated)
-    work.share[k] = share_of(row, 0, belief)
+    work.share[k] = sources.share_of(row, 0, belief)
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k], work.place[k] = 0.0, False, (one.value[0], 0.0)
     # Gate, also what is not finite.
@@ -669,8 +555,8 @@ def evaluate_link(
         work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
     # What its link has from these places already counts less.
     own = float((s - noise)[0, 0]), float(innovation[0]), bool(work.accepted[k])
-    variance = noise_of_range(row, 0, belief, tracks, *own)
-    repeats = work.share[k] if work.share[k] == LEAST_SHARE else 1.0
+    variance = correlated_noise.noise_of_range(row, 0, belief, tracks, *own)
+    repeats = work.share[k] if work.share[k] == sources.LEAST_SHARE else 1.0
     work.noise[k, :count, :count] *= variance / (repeats * float(one.covariance[0, 0]))
 
 
@@ -682,7 +568,7 @@ def _write_radios(
     Returns:
         What they add to the value, and their columns; -1: not estimated.
     """
-    bias, found, weights = 0.0, [-1, -1], MODELS[int(one.model)].radios
+    bias, found, weights = 0.0, [-1, -1], models.MODELS[int(one.model)].radios
     for i, (robot, weight) in enumerate(zip((int(one.observer), int(one.target)), weights, strict=True)):
         if robot >= 0 and weight != 0.0:
             bias += weight * float(belief.parameter[robot, RADIO_BIAS])
@@ -692,9 +578,12 @@ def _write_radios(
     return bias, found
 
 
-def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) -> FloatArray:
+@inlined_njit
+def _driven(
+    tracks: track_arrays.TrackArrays, robot: int, stamp_ns: int, pose: FloatArray
+) -> tuple[float, float, float]:
     """Right-invariant velocity twist (3,) of a robot at a pose (3,) in `map` [1/s]."""
-    forward, left, turn = rate_at(tracks, robot, stamp_ns)
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    forward, left, turn = track_arrays.rate_at(tracks, robot, stamp_ns)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
     x, y = cos * forward - sin * left, sin * forward + cos * left
-    return np.array([x + turn * pose[1], y - turn * pose[0], turn])
+    return x + turn * pose[1], y - turn * pose[0], turn

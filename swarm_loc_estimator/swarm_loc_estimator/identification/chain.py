@@ -5,6 +5,16 @@ or clutter. So the likelihood of a chain is the product over images of P_D N(z; 
 chain has a detection and of 1 - P_D where it has none (one target in clutter). The density beta covers other
 robots anywhere in the picture, and a robot of the same kind that was at the chain's last detection and moved
 about as far. A robot that enters the picture later starts a chain there.
+
+Tracks: chains of detections that may be one robot, each with a Gaussian estimate of (p, c): the position p in
+`map`, and c = lambda exp(i theta), which turns the robot's own track into the map, with the image's scale
+lambda. In these four real numbers motion and measurement are linear: p <- p + c w for the way w along the
+track, z = p. Only a measured heading is not, and is linearised.
+
+Anchors: detections at which chains without a known heading start. A robot that was at z and has moved by |W|
+since lies on a circle around z, with equal density in every direction. The density of a detection at distance
+|D| follows Rice's distribution, in closed form also for small motions. For larger motions the direction gives
+the heading, and the chain becomes a track.
 """
 
 from __future__ import annotations
@@ -16,27 +26,256 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.identification.anchors import (
-    Anchors,
-    Scale,
-    circles,
-    is_concentrated,
-    merged,
-    shown_by_heading,
-    tracks_of,
+from swarm_loc_estimator.identification.picture import (
+    Picture,
+    TrackPoint,
+    gathered_between,
+    squared_distances,
 )
-from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
-from swarm_loc_estimator.identification.tracks import (
-    MISSED,
-    NO_TRACKS,
-    Tracks,
-    joined,
-    log_likelihoods,
-    predicted,
-    updated,
-)
+
+MISSED = -1  # Place of a chain without a detection in the newest image
+_FALSE_HEADING = 0.02  # Share of detected headings that are wrong and uniformly distributed
+_LOG_TURN = float(np.log(2.0 * np.pi))
+
+
+class Tracks(NamedTuple):
+    """Chains (h,) of detections."""
+
+    mean: FloatArray  # (h, 4) p [m], c [1], real and imaginary parts
+    covariance: FloatArray  # (h, 4, 4)
+    log_weight: FloatArray  # (h,) log probabilities, up to a common constant
+    place: IntArray  # (h,) detection of the newest image at which each ends, or MISSED
+    length: IntArray  # (h,) number of detections of each
+
+    def select(self, rows: IntArray) -> Tracks:
+        """The tracks of the given rows."""
+        return Tracks(*(column[rows] for column in self))  # type: ignore[arg-type] # each keeps its type
+
+
+_NONE: IntArray = np.zeros(0, dtype=np.int64)
+NO_TRACKS = Tracks(np.zeros((0, 4)), np.zeros((0, 4, 4)), np.zeros(0), _NONE, _NONE)
+
+
+def joined(parts: list[Tracks]) -> Tracks:
+    """The tracks of all parts, in one container."""
+    return Tracks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def predicted(tracks: Tracks, way: complex, noise: FloatArray, scale_variance: float) -> Tracks:
+    """Tracks (h,) predicted by a displacement along the robot's track, in the frame of that [m].
+
+    It adds a covariance (3, 3) to x, y, heading in this frame, and one of the logarithm of the image's scale.
+    """
+    move = np.eye(4)
+    move[:2, 2:] = [[way.real, -way.imag], [way.imag, way.real]]  # multiplies complex numbers by the way
+    mean = tracks.mean @ move.T
+    covariance = move @ tracks.covariance @ move.T
+    real, imag = mean[:, 2], mean[:, 3]
+    drive = np.zeros((len(mean), 4, 3))
+    drive[:, 0, 0] = drive[:, 1, 1] = drive[:, 3, 2] = real
+    drive[:, 1, 0], drive[:, 0, 1], drive[:, 2, 2] = imag, -imag, -imag
+    covariance += drive @ noise @ drive.transpose(0, 2, 1)
+    covariance[:, 2:, 2:] += scale_variance * mean[:, 2:, None] * mean[:, None, 2:]
+    return tracks._replace(mean=mean, covariance=covariance)
+
+
+def log_likelihoods(tracks: Tracks, picture: Picture, spread: float = 0.0) -> FloatArray:
+    """Log densities (h, n) of detected positions (n,) under the predictions of the tracks (h,) [1/m^2].
+
+    `spread` is an additional standard deviation of x and y [m].
+    """
+    squared, determinant = squared_distances(tracks.mean, tracks.covariance, picture, spread)
+    return np.asarray(-0.5 * squared - _LOG_TURN - 0.5 * np.log(determinant))
+
+
+def updated(
+    tracks: Tracks, picture: Picture, places: IntArray, track_heading: float, turn_spread: float = math.inf
+) -> Tracks:
+    """Predicted tracks (h,) updated with one detection (h,) each; weights change by headings only.
+
+    The robot has a heading on its own track, and the turn of another one a standard deviation from its own
+    [rad].
+    """
+    s = tracks.covariance[:, :2, :2] + picture.covariance[places][:, :2, :2]
+    gain = np.linalg.solve(s, tracks.covariance[:, :2, :]).transpose(0, 2, 1)
+    away = picture.pose[places, :2] - tracks.mean[:, :2]
+    covariance = tracks.covariance - gain @ tracks.covariance[:, :2, :]
+    mean = tracks.mean + (gain @ away[..., None])[..., 0]
+    out = Tracks(mean, _symmetric(covariance), tracks.log_weight, places, tracks.length + 1)
+    shown = np.flatnonzero(picture.has_heading[places])
+    return _with_headings(out, picture, shown, track_heading, turn_spread) if shown.size else out
+
+
+def _with_headings(
+    tracks: Tracks, picture: Picture, rows: IntArray, track_heading: float, turn_spread: float
+) -> Tracks:
+    """Tracks (h,) after an update of some rows (r,) with the detected headings."""
+    mean, covariance = tracks.mean[rows], tracks.covariance[rows]
+    places = tracks.place[rows]
+    real, imag = mean[:, 2], mean[:, 3]
+    jacobian = np.zeros((rows.size, 4))
+    jacobian[:, 2], jacobian[:, 3] = -imag / (real**2 + imag**2), real / (real**2 + imag**2)
+    predicted_heading = np.arctan2(imag, real) + track_heading
+    innovation = wrap_angle(picture.pose[places, 2] - predicted_heading)
+    projected = (covariance @ jacobian[..., None])[..., 0]
+    variance = picture.covariance[places, 2, 2] + np.sum(projected * jacobian, axis=1)
+    right = (1.0 - _FALSE_HEADING) * _times_turn(innovation, variance)
+    others = np.ones(rows.size)
+    if math.isfinite(turn_spread):
+        others = 0.5 + 0.5 * _times_turn(innovation, variance + turn_spread**2)
+    share = right / (right + _FALSE_HEADING)
+    gain = projected / variance[:, None] * (share > 0.5)[:, None]
+    changed = Tracks._make(column.copy() for column in tracks)
+    changed.mean[rows] += gain * innovation[:, None]
+    changed.covariance[rows] = _symmetric(covariance - gain[:, :, None] * projected[:, None, :])
+    changed.log_weight[rows] += np.log((right + _FALSE_HEADING) / others)
+    return changed
+
+
+def _times_turn(innovation: FloatArray, variance: FloatArray) -> FloatArray:
+    """Normal densities (k,) of angles relative to the uniform density."""
+    return np.asarray(np.exp(-0.5 * innovation**2 / variance) * np.sqrt(2.0 * np.pi / variance))
+
+
+def _symmetric(covariance: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)))
+
+
+_CONCENTRATED = 8.0  # Concentration from which a von Mises heading is treated as Gaussian: 0.36 rad
+_ANY_DIRECTION = 3.0
+"""Standard deviation of c along the circle before its direction is known; wide for a linear model."""
+
+
+class Scale(NamedTuple):
+    """Scale of an image."""
+
+    mean: float  # Units of the image per metre of the robot's own motion
+    sigma: float  # Standard deviation of the mean, in the same unit
+
+
+class Anchors(NamedTuple):
+    """Detections (a,) of one image that are candidates for the robot."""
+
+    point: TrackPoint  # The robot's own track at that image
+    stamp_ns: int  # Of the image
+    position: FloatArray  # (a, 2) [m]
+    covariance: FloatArray  # (a, 2, 2)
+    log_weight: FloatArray  # (a,) up to the constant of the tracks
+    place: IntArray  # (a,) which detection of the newest image each is; MISSED: of an earlier one
+
+    def select(self, rows: IntArray) -> Anchors:
+        """The anchors of the given rows."""
+        return Anchors(*self[:2], *(column[rows] for column in self[2:]))  # type: ignore[arg-type]
+
+
+class Circles(NamedTuple):
+    """Pairs (a, n) of an anchor and a detection of a later image."""
+
+    log_density: FloatArray  # (a, n) of the detection, if it is the robot that the anchor is [1/m^2]
+    log_alike: FloatArray  # (a, n) the same if both are another robot, which moves about as far
+    concentration: FloatArray  # (a, n) of the heading that the pair shows
+
+
+def own_way(anchors: Anchors, point: TrackPoint) -> complex:
+    """Displacement of the robot along its track since the image of the anchors, in the track's frame [m]."""
+    x, y = point.pose[:2] - anchors.point.pose[:2]
+    return complex(x, y)
+
+
+def circles(anchors: Anchors, picture: Picture, point: TrackPoint, scale: Scale, likeness: float) -> Circles:
+    """Densities of detections (n,) on the circles around anchors (a,).
+
+    `point` is of the robot's own track at the picture, `likeness` the relative standard deviation of the
+    distance that another robot moves.
+    """
+    way = abs(own_way(anchors, point))
+    gathered = scale.mean**2 * 0.5 * float(np.trace(gathered_between(anchors.point, point)[:2, :2]))
+    variance = 0.5 * np.trace(anchors.covariance, axis1=1, axis2=2)[:, None] + picture.variance + gathered
+    away = picture.pose[None, :, :2] - anchors.position[:, None]
+    distance = np.hypot(away[..., 0], away[..., 1])
+    log_density, concentration = _rice(distance, way, variance, scale)
+    others = Scale(scale.mean, math.hypot(scale.sigma, likeness * scale.mean))
+    return Circles(log_density, _rice(distance, way, variance, others)[0], concentration)
+
+
+def _rice(
+    distance: FloatArray, way: float, variance: FloatArray, scale: Scale
+) -> tuple[FloatArray, FloatArray]:
+    """Log densities (a, n) at distances from a circle's middle, and concentrations of the direction."""
+    along = variance + (scale.sigma * way) ** 2
+    likely = scale.mean + scale.sigma**2 * way * (distance - scale.mean * way) / along
+    concentration = np.maximum(likely, 0.0) * distance * way / variance
+    log_density = (
+        np.log(scipy.special.i0e(concentration)) - np.log(2.0 * np.pi) - 0.5 * np.log(variance * along)
+    )
+    return log_density - 0.5 * (distance - scale.mean * way) ** 2 / along, concentration
+
+
+def tracks_of(
+    anchors: Anchors, rows: IntArray, picture: Picture, places: IntArray, point: TrackPoint, scale: Scale
+) -> Tracks:
+    """The tracks (k,) that pairs of an anchor (of rows) and a detection (of places) give.
+
+    Their weights are those of the anchors, changed by the detections' headings alone.
+    """
+    if not rows.size:
+        return NO_TRACKS
+    way = own_way(anchors, point)
+    start = anchors.position[rows]
+    away = (picture.pose[places, :2] - start) @ [1.0, 1.0j]
+    direction = np.exp(1j * (np.angle(away) - np.angle(way)))
+    tracks = _tracks_from(start, anchors.covariance[rows], direction, scale, _ANY_DIRECTION)
+    tracks = tracks._replace(log_weight=anchors.log_weight[rows])
+    moved = predicted(tracks, way, gathered_between(anchors.point, point), 0.0)
+    return updated(moved, picture, places, float(point.pose[2]))
+
+
+def shown_by_heading(picture: Picture, places: IntArray, point: TrackPoint, scale: Scale) -> Tracks:
+    """The tracks (k,) that begin with detections which show a heading; their weights are zero."""
+    direction = np.exp(1j * (picture.pose[places, 2] - point.pose[2]))
+    covariance = picture.covariance[places]
+    sigma = np.sqrt(covariance[:, 2, 2])
+    tracks = _tracks_from(picture.pose[places, :2], covariance[:, :2, :2], direction, scale, sigma)
+    return tracks._replace(place=places)
+
+
+def is_concentrated(concentration: FloatArray) -> BoolArray:
+    """Whether pairs show a heading well enough for a track."""
+    return np.asarray(concentration > _CONCENTRATED)
+
+
+def merged(
+    place: IntArray, log_weight: FloatArray, picture: Picture, point: TrackPoint, stamp_ns: int
+) -> Anchors:
+    """Anchors at the newest image, one for each detection of `place` (k,), which may name one repeatedly."""
+    places = np.unique(place)
+    weight = np.array([scipy.special.logsumexp(log_weight[place == one]) for one in places])
+    covariance = picture.covariance[places][:, :2, :2]
+    return Anchors(point, stamp_ns, picture.pose[places, :2], covariance, weight, places)
+
+
+def _tracks_from(
+    position: FloatArray,
+    covariance: FloatArray,
+    direction: np.typing.NDArray[np.complex128],
+    scale: Scale,
+    across: float | FloatArray,
+) -> Tracks:
+    """Tracks (k,) at positions, with directions of c that are unsure by `across` [rad]."""
+    count = len(position)
+    along = np.column_stack([direction.real, direction.imag])
+    normal = np.column_stack([-direction.imag, direction.real])
+    matrix = np.zeros((count, 4, 4))
+    matrix[:, :2, :2] = covariance
+    turn = np.broadcast_to((scale.mean * np.asarray(across)) ** 2, (count,))
+    matrix[:, 2:, 2:] = scale.sigma**2 * along[:, :, None] * along[:, None, :]
+    matrix[:, 2:, 2:] += turn[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    mean = np.hstack([position, scale.mean * along])
+    place, length = np.zeros(count, dtype=np.int64), np.ones(count, dtype=np.int64)
+    return Tracks(mean, matrix, np.zeros(count), place, length)
+
 
 _NEGLIGIBLE = 12.0  # Chains whose log weight lies this far below the largest one are dropped
 _MAX_TRACKS = 3000
@@ -109,8 +348,7 @@ class Chains:
 
     def _with(self, picture: Picture, point: TrackPoint, stamp_ns: int) -> Chains:
         """The chains, whose bounds hold for the image already, after it."""
-        log_density = self._log_density(picture)
-        tracks, anchors = self._continued(picture, point, stamp_ns, log_density)
+        tracks, anchors = self._continued(picture, point, stamp_ns, self._log_density(picture))
         return self._normalised(picture, point, stamp_ns, tracks, anchors)
 
     @property

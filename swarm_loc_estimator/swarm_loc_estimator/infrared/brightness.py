@@ -60,14 +60,9 @@ def curve_at(table: CurveTable, angle: float) -> tuple[float, float]:
 def curves_at(
     table: CurveTable, angles: FloatArray, piece: FloatArray, values: FloatArray, slopes: FloatArray
 ) -> None:
-    """Write the values and slopes of `curve_at` at many angles (k,), without a branch.
+    """Write the values and slopes [1/rad] of `curve_at` at many angles (k,), without a branch.
 
-    Args:
-        table: The curve.
-        angles: Any angles [rad]; wrapped in place.
-        piece: (k,) workspace for the index of the piece that contains each angle.
-        values: (k,) written.
-        slopes: (k,) written [1/rad].
+    Angles are wrapped in place; `piece` (k,) is workspace for the piece that contains each of them.
     """
     edges, cells = table.edges, table.cubics.shape[1]
     for k in range(angles.size):
@@ -177,33 +172,6 @@ def _at(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None) -> tupl
 WAY_ROWS = 22  # Number of rows of the workspace of `predict_brightness`
 
 
-class _Ways(NamedTuple):
-    """Quantities of the W = n * n paths from each sensor to each emitter (W,), ordered by sensor.
-
-    Every step of a prediction is a vectorized loop over all paths, without branches.
-    """
-
-    x: FloatArray  # From sensor to emitter in the receiver's frame [m]
-    y: FloatArray
-    length: FloatArray  # Polar coordinates of that vector [m], [rad]
-    direction: FloatArray
-    emitter_x: FloatArray  # The emitter's direction in the receiver's frame
-    emitter_y: FloatArray
-    at_sensor: FloatArray  # Angles between the path and the axes of sensor and emitter [rad]
-    at_emitter: FloatArray
-    piece: FloatArray  # Workspace of `curves_at`
-    seen: FloatArray  # The curve S
-    seen_slope: FloatArray
-    lit: FloatArray  # The curve E
-    lit_slope: FloatArray
-    share: FloatArray  # The product of S and E
-    bright: FloatArray  # The amplitude of one power
-    bright_slope: FloatArray
-    # (3, W) factors in the derivatives by range, bearing and heading: of the amplitude's slope
-    by_length: FloatArray
-    by_turn: FloatArray  # (3, W) of the amplitude
-
-
 @cached_njit
 def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
     work = np.empty((WAY_ROWS, model.angles.size**2))
@@ -223,61 +191,54 @@ def predict_brightness(
 ) -> None:
     """Write readings (modes * n * n,) and their slopes (3, modes * n * n) of one pose.
 
-    The workspace is (WAY_ROWS, n * n).
+    The workspace is (WAY_ROWS, n * n), for the paths from each sensor to each emitter, ordered by sensor.
+    Every step is a loop over all paths, without branches where it can be vectorized.
     """
-    r = work
-    ways = _Ways(
-        r[0],
-        r[1],
-        r[2],
-        r[3],
-        r[4],
-        r[5],
-        r[6],
-        r[7],
-        r[8],
-        r[9],
-        r[10],
-        r[11],
-        r[12],
-        r[13],
-        r[14],
-        r[15],
-        r[16:19],
-        r[19:22],
-    )
-    # the vectors r from sensors to emitters, their lengths, and the angles at both ends, eqs (1)-(4)
-    _lay(model, distance, bearing, heading, ways)
-    _measure(ways.x, ways.y, ways.length, ways.direction)
-    _write_angles(model.angles, heading, ways)
-    # the curves S and E there, and what does not depend on the power
-    curves_at(model.sensor, ways.at_sensor, ways.piece, ways.seen, ways.seen_slope)
-    curves_at(model.emitter, ways.at_emitter, ways.piece, ways.lit, ways.lit_slope)
-    _write_changes(model.radius, distance, bearing, ways)
-    # for each power the readings A S E, and their derivatives by range, bearing and heading
-    count = ways.share.size
+    n, units, rho, count = model.angles.size, model.units, model.radius, work.shape[1]
+    x, y, length, direction, piece = work[0], work[1], work[2], work[3], work[8]
+    emitter_x, emitter_y, at_sensor, at_emitter = work[4], work[5], work[6], work[7]
+    seen, seen_slope, lit, lit_slope, share = work[9], work[10], work[11], work[12], work[13]
+    bright, bright_slope, by_length, by_turn = work[14], work[15], work[16:19], work[19:22]
+    # the directions of the emitters, and the vectors r from sensors to them, in the receiver's frame, eq. (1)
+    cos, sin = math.cos(heading), math.sin(heading)
+    ux, uy = math.cos(bearing), math.sin(bearing)
+    for j in range(n):
+        jx, jy = cos * units[j, 0] - sin * units[j, 1], sin * units[j, 0] + cos * units[j, 1]
+        for i in range(n):
+            emitter_x[i * n + j], emitter_y[i * n + j] = jx, jy
+            x[i * n + j] = distance * ux + rho * (jx - units[i, 0])
+            y[i * n + j] = distance * uy + rho * (jy - units[i, 1])
+    # their lengths and directions, and the angles at both ends, eqs (2)-(4)
+    _measure(x, y, length, direction)
+    for i in range(n):
+        for j in range(n):
+            at_sensor[i * n + j] = direction[i * n + j] - model.angles[i]
+            at_emitter[i * n + j] = direction[i * n + j] + math.pi - model.angles[j] - heading
+    # the curves S and E there, and what does not depend on the power: factors in the derivatives by range,
+    # bearing and heading, of the amplitude's slope and of the amplitude
+    curves_at(model.sensor, at_sensor, piece, seen, seen_slope)
+    curves_at(model.emitter, at_emitter, piece, lit, lit_slope)
+    for w in range(count):
+        per_r = 1.0 / length[w]
+        vx, vy, of_emitter = x[w] * per_r, y[w] * per_r, seen[w] * lit_slope[w]
+        turned = (seen_slope[w] * lit[w] + of_emitter) * per_r  # by the direction of the path
+        share[w] = seen[w] * lit[w]
+        # motion of the emitter along the path and across it
+        forward, aside = vx * ux + vy * uy, vx * uy - vy * ux
+        by_length[0, w], by_turn[0, w] = share[w] * forward, turned * aside
+        by_length[1, w], by_turn[1, w] = -share[w] * distance * aside, turned * distance * forward
+        jx, jy = emitter_x[w], emitter_y[w]
+        forward, aside = vx * jx + vy * jy, vx * jy - vy * jx
+        by_length[2, w], by_turn[2, w] = -share[w] * rho * aside, turned * rho * forward - of_emitter
+    # for each power the readings A S E, and their derivatives
     for m in range(model.amplitudes.shape[0]):
         begin, end = m * count, (m + 1) * count
-        amplitudes_at(model.amplitudes[m], ways.length, ways.bright, ways.bright_slope)
-        _multiply(ways.share, ways.bright, readings[begin:end])
+        amplitudes_at(model.amplitudes[m], length, bright, bright_slope)
+        out = readings[begin:end]
+        for w in range(count):
+            out[w] = share[w] * bright[w]
         for p in range(3):
-            by_length, by_turn, slope = ways.by_length[p], ways.by_turn[p], slopes[p, begin:end]
-            _combine(by_length, ways.bright_slope, by_turn, ways.bright, slope)
-
-
-@norefcount_njit
-def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: _Ways) -> None:
-    """Write the emitters' directions and the paths to them."""
-    n, units, rho = model.angles.size, model.units, model.radius
-    cos, sin = math.cos(heading), math.sin(heading)
-    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
-    for j in range(n):
-        emitter_x = cos * units[j, 0] - sin * units[j, 1]
-        emitter_y = sin * units[j, 0] + cos * units[j, 1]
-        for i in range(n):
-            ways.emitter_x[i * n + j], ways.emitter_y[i * n + j] = emitter_x, emitter_y
-            ways.x[i * n + j] = x + rho * (emitter_x - units[i, 0])
-            ways.y[i * n + j] = y + rho * (emitter_y - units[i, 1])
+            _combine(by_length[p], bright_slope, by_turn[p], bright, slopes[p, begin:end])
 
 
 @cached_njit
@@ -286,44 +247,6 @@ def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatA
     for k in range(x.size):
         length[k] = math.sqrt(max(x[k] * x[k] + y[k] * y[k], 1e-12))
         direction[k] = direction_of(y[k], x[k])
-
-
-@norefcount_njit
-def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
-    """Write the angles of the paths at sensors and emitters with axes `angles` [rad]."""
-    n = angles.size
-    for i in range(n):
-        for j in range(n):
-            direction = ways.direction[i * n + j]
-            ways.at_sensor[i * n + j] = direction - angles[i]
-            ways.at_emitter[i * n + j] = direction + math.pi - angles[j] - heading
-
-
-@norefcount_njit
-def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> None:
-    ux, uy = math.cos(bearing), math.sin(bearing)
-    by_length, by_turn = ways.by_length, ways.by_turn
-    for w in range(ways.share.size):
-        jx, jy = ways.emitter_x[w], ways.emitter_y[w]
-        per_r = 1.0 / ways.length[w]
-        vx, vy = ways.x[w] * per_r, ways.y[w] * per_r
-        seen, lit = ways.seen[w], ways.lit[w]
-        share, of_emitter = seen * lit, seen * ways.lit_slope[w]
-        turned = (ways.seen_slope[w] * lit + of_emitter) * per_r  # by the direction of the path
-        # motion of the emitter along the path and across it
-        forward, aside = vx * ux + vy * uy, vx * uy - vy * ux
-        ways.share[w] = share
-        by_length[0, w], by_turn[0, w] = share * forward, turned * aside
-        by_length[1, w], by_turn[1, w] = -share * distance * aside, turned * distance * forward
-        forward, aside = vx * jx + vy * jy, vx * jy - vy * jx
-        by_length[2, w], by_turn[2, w] = -share * rho * aside, turned * rho * forward - of_emitter
-
-
-@cached_njit
-def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Write the products of the entries of two vectors."""
-    for w in range(out.size):
-        out[w] = a[w] * b[w]
 
 
 @cached_njit
@@ -339,15 +262,10 @@ _BESIDE = 1.5  # Maximum distance of poses that belong to one minimum, in steps 
 
 @cached_njit
 def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covariance: FloatArray) -> float:
-    """Add the spread of other likely poses to a pose's covariance (3, 3).
+    """Add the spread of other likely poses to the covariance (3, 3) of a pose (3,): range, bearing, heading.
 
-    The prior is uniform over the plane. Ranges form a geometric series, so each is weighted by its square.
-
-    Args:
-        table: Start table of the platform.
-        work: Workspace with the costs of the readings.
-        pose: (3,) range [m], bearing, heading [rad].
-        covariance: (3, 3) increased in place.
+    `work` has the costs of the readings. The prior is uniform over the plane. Ranges form a geometric series,
+    so each is weighted by its square.
 
     Returns:
         The larger of the mean squared deviations of all poses in bearing and heading from this pose.
@@ -372,15 +290,10 @@ def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covari
             r = table.ranges[k] - pose[0]
             rr, rb, rh = rr + weight * r * r, rb + weight * r * b, rh + weight * r * h
             bb, bh, hh = bb + weight * b * b, bh + weight * b * h, hh + weight * h * h
-    covariance[0, 0] += rr / total
-    covariance[1, 1] += bb / total
-    covariance[2, 2] += hh / total
-    covariance[0, 1] += rb / total
-    covariance[1, 0] += rb / total
-    covariance[0, 2] += rh / total
-    covariance[2, 0] += rh / total
-    covariance[1, 2] += bh / total
-    covariance[2, 1] += bh / total
+    spread = ((rr, rb, rh), (rb, bb, bh), (rh, bh, hh))
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] += spread[i][j] / total
     return max(all_b, all_h) / total
 
 
@@ -481,14 +394,10 @@ def find_starts(
 ) -> int:
     """Write the best start poses, best first, each a local minimum of the table; returns their number.
 
-    Args:
-        table: Start table of the platform.
-        pattern: (modes * n * n,) the readings by `compress`, any finite value where missing.
-        present: (modes * n * n,) 1 where there is a reading, else 0.
-        dark: Maximum of possibly blocked readings, by `compress`. If finite, all ranges are tried, since the
-            total brightness is unreliable; inf: any may be blocked or too bright; -inf: none is blocked.
-        work: Workspace.
-        starts: (S, 4) written: range, bearing, heading, misfit.
+    `pattern` (modes * n * n,) are the readings by `compress`, any finite value where missing, `present` is 1
+    where there is one, else 0. `dark` is the maximum of possibly blocked readings, by `compress`: if finite,
+    all ranges are tried, since the total brightness is unreliable; inf: any may be blocked or too bright;
+    -inf: none is blocked. Starts (S, 4) are range, bearing, heading, misfit.
     """
     total, count = np.float32(0.0), np.float32(0.0)
     for f in range(pattern.size):
@@ -504,8 +413,12 @@ def find_starts(
                     level = k
             work.level[d], work.misfit[d] = level, costs[level]
             continue
-        if dark > -math.inf:
-            work.level[d], work.misfit[d] = _best_level(patterns, pattern, present, np.float32(dark))
+        if dark > -math.inf:  # the range whose pattern fits best
+            work.level[d], work.misfit[d] = 0, np.float32(math.inf)
+            for k in range(patterns.shape[0]):
+                misfit = _misfit(patterns[k], pattern, present, np.float32(dark))
+                if misfit < work.misfit[d]:
+                    work.level[d], work.misfit[d] = k, misfit
             continue
         if count == pattern.size:
             level = _level(table.totals[d], total)
@@ -533,19 +446,6 @@ def _level(totals: Float32Array, total: np.float32) -> int:
         low += half if totals[low + half] >= total else 0
         size -= half
     return low if totals[low] - total < total - totals[low + 1] else low + 1
-
-
-@norefcount_njit
-def _best_level(
-    patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
-) -> tuple[int, float]:
-    """Index of the range whose pattern (of L, modes * n * n) fits best, and its misfit."""
-    best, least = 0, np.float32(math.inf)
-    for level in range(patterns.shape[0]):
-        misfit = _misfit(patterns[level], pattern, present, dark)
-        if misfit < least:
-            best, least = level, misfit
-    return best, least
 
 
 @reassociated_njit
@@ -576,10 +476,7 @@ def _misfit(
 def _cost_with_outliers(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array
 ) -> np.float32:
-    """The negative log likelihood of readings, each of which may be blocked or too bright.
-
-    The excess of a reading that is too bright has an exponential distribution.
-    """
+    """The negative log likelihood of readings that may be blocked, or too bright by an exponential excess."""
     total: np.float32 = np.float32(0.0)
     for f in range(pattern.size):
         z = _PER_SIGMA * (pattern[f] - expected_here[f])

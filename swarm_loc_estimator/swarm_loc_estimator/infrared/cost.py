@@ -61,14 +61,9 @@ def spread(errors: ReadingErrors, value: float) -> float:
 def reading_cost(
     errors: ReadingErrors, kind: int, reading: float, stable: float, expected: float
 ) -> tuple[float, float, float, bool, float, float]:
-    """The cost of a reading and its first two derivatives by the expected reading.
+    """The cost of a MEASURED or SATURATED reading and its two derivatives by the expected reading [count].
 
-    Args:
-        errors: Noise and outliers of the platform.
-        kind: MEASURED or SATURATED.
-        reading: Cut at saturation [count].
-        stable: The reading by `stabilized` [sigma].
-        expected: The expected reading with gains [count].
+    The reading is cut at saturation [count], and given by `stabilized`, too [sigma].
 
     Returns:
         Cost, first and second derivative, whether the reading is certainly an inlier, the systematic share of
@@ -94,30 +89,18 @@ def reading_cost(
     cost, pull, weight = 0.5 * square, more * slope, slope * slope
     if limit < math.inf:
         near = cost < BELIEVED
-        if more < 0.0:
-            cost, pull, weight = _of_bright(errors, reading - expected, cost, pull, weight)
+        if more < 0.0:  # it may be too bright: light that is not modelled has an exponential distribution
+            per_count = 1.0 / (_STRAY * errors.noise)
+            other = errors.bright + _STRAY_DENSITY + per_count * (reading - expected)
+            if cost >= other - _SURELY:
+                own = 1.0 / (1.0 + math.exp(cost - other))
+                cost = min(cost, other) - math.log1p(math.exp(-abs(cost - other)))
+                pull, weight = own * pull - (1.0 - own) * per_count, own * weight
         elif not near:  # it may be blocked: a robust loss, whose cost saturates at the limit
             seen = math.exp((BELIEVED - cost) / limit)
             cost, pull, weight = BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
         return cost, pull, weight, near and two_sided, systematic, square
     return cost, pull, weight, True, systematic, square
-
-
-@cached_njit
-def _of_bright(
-    errors: ReadingErrors, more: float, cost: float, pull: float, weight: float
-) -> tuple[float, float, float]:
-    """The cost of a reading that is brighter than expected by `more` [count], and its derivatives.
-
-    The brightness of light that is not modelled has an exponential distribution.
-    """
-    per_count = 1.0 / (_STRAY * errors.noise)
-    other = errors.bright + _STRAY_DENSITY + per_count * more
-    if cost < other - _SURELY:
-        return cost, pull, weight
-    own = 1.0 / (1.0 + math.exp(cost - other))
-    total = min(cost, other) - math.log1p(math.exp(-abs(cost - other)))
-    return total, own * pull - (1.0 - own) * per_count, own * weight
 
 
 @cached_njit
@@ -205,25 +188,15 @@ class CostWorkspace(NamedTuple):
 def new_cost_workspace(modes: int, n: int, gains: bool) -> CostWorkspace:
     """Memory for a board with n elements per side; `gains`: whether gains are estimated."""
     size, readings = 3 + 2 * n if gains else 3, modes * n * n
-    return CostWorkspace(
-        np.empty((WAY_ROWS, n * n)),
-        np.empty(readings),
-        np.empty((3, readings)),
-        np.empty(readings),
-        np.empty(readings),
-        np.zeros(size),
-        np.zeros(size),
-        np.empty(readings),
-        np.empty((2, size)),
-        np.empty((2, size, size)),
-        np.empty((size, size)),
-        np.empty(size),
-        np.empty(3),
-        np.zeros((3, 3)),
-        np.zeros(3),
-        np.zeros((3, 3)),
-        np.zeros((3, 3)),
-    )
+    # one array each: sums may be in another order where the compiler cannot tell that they are apart
+    expected, pulls = np.empty(readings), np.empty(readings)
+    weights, factors = np.empty(readings), np.empty(readings)
+    at, trial, step = np.zeros(size), np.zeros(size), np.empty(size)
+    tally, of_gains = np.empty(3), np.zeros(3)
+    of_readings = np.empty((WAY_ROWS, n * n)), expected, np.empty((3, readings)), pulls, weights
+    matrices = np.empty((2, size)), np.empty((2, size, size)), np.empty((size, size)), step, tally
+    systematic, root, first_root = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    return CostWorkspace(*of_readings, at, trial, factors, *matrices, systematic, of_gains, root, first_root)
 
 
 @cached_njit
@@ -234,19 +207,7 @@ def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
         if math.isfinite(reading):
             brightest = max(brightest, reading)
     noise = math.hypot(e.noise, model.stray * min(brightest, model.saturation))
-    return IrModel(
-        model.radius,
-        model.angles,
-        model.units,
-        model.sensor,
-        model.emitter,
-        model.amplitudes,
-        model.saturation,
-        noise,
-        ReadingErrors(noise, e.relative, e.systematic, e.blocked, e.bright),
-        model.stray,
-        model.scale,
-    )
+    return IrModel(*model[:7], noise, ReadingErrors(noise, *e[1:]), *model[9:])
 
 
 @norefcount_njit

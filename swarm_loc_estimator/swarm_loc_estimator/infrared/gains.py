@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -84,7 +84,13 @@ def estimate_gains(
     estimator = MaximumLikelihood(platform)
     logs = np.zeros((2, robots, platform.n))
     unknown = _pairs(exchanges, logs, platform.element_sigma)
-    _check_curves(estimator, exchanges, unknown)
+    misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
+    found = misfits[np.isfinite(misfits)]
+    if found.size and np.median(found) > _MAX_MISFIT:  # most exchanges fit no pose with free gains
+        raise GainsError(
+            f"its curves do not hold, for readings are off by {np.sqrt(np.median(found)):.1f} sigma whatever"
+            " poses and gains are taken; find the board itself first, with `calibrate_ir --board`."
+        )
     poses, used = _poses(estimator, exchanges, unknown)
     before = _residuals(platform, exchanges, logs, poses, used)
     for number in range(_ROUNDS):
@@ -107,26 +113,12 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
     return PairGains(factors[0, exchanges.receiver], factors[1, exchanges.transmitter], sigmas)
 
 
-def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
-    """Raise GainsError if most exchanges fit no pose with free gains."""
-    misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
-    found = misfits[np.isfinite(misfits)]
-    if found.size and np.median(found) > _MAX_MISFIT:
-        raise GainsError(
-            f"its curves do not hold, for readings are off by {np.sqrt(np.median(found)):.1f} sigma whatever"
-            " poses and gains are taken; find the board itself first, with `calibrate_ir --board`."
-        )
-
-
 def _poses(
     estimator: MaximumLikelihood, exchanges: Exchanges, pairs: PairGains
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The pose (k, 3) of every exchange, and which of them are reliable.
+    """The pose (k, 3) of every exchange, and which are reliable; raises GainsError if none is.
 
     Known poses are combined with the readings, since robots may have moved during the exchange.
-
-    Raises:
-        GainsError: No pose is reliable.
     """
     solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
     known = np.isfinite(exchanges.poses[:, 0])
@@ -214,12 +206,8 @@ def _improved(
 def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> tuple[FloatArray, FloatArray]:
     """Information matrices (u, 2n, 2n) and vectors (u, 2n) of each exchange on log-gains of its elements.
 
-    The pose, with its prior, and the background of each sensor are eliminated.
-
-    Args:
-        linear: The readings.
-        to_known: (u, 3) known minus estimated poses; NaN where unknown.
-        background: Standard deviation of each sensor's background [count].
+    The pose, whose prior is the known minus the estimated one (u, 3), or NaN, and the background of each
+    sensor, of this standard deviation [count], are eliminated.
     """
     weight, expected, slopes = linear.weight, linear.expected, linear.slopes
     bright = weight * expected
@@ -245,10 +233,9 @@ def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> t
 
 
 def _of_background(linear: _Linear, sigma: float) -> FloatArray:
-    """The part of the normal equations that is lost to the unknown background of each sensor.
+    """What is lost to the unknown background of each sensor, of the normal equations (u, 2n + 4, 2n + 4).
 
-    Returns:
-        (u, 2n + 4, 2n + 4) products of the columns of sensors, emitters, pose and residual.
+    Their columns are those of sensors, emitters, pose and residual.
     """
     weight, own = linear.weight, np.arange(linear.weight.shape[2])
     bright = (weight * linear.expected).sum(axis=1)
@@ -269,25 +256,19 @@ def _as_gains(
 ) -> tuple[IrGains, ...]:
     """Gains with standard deviations from the larger of the covariances (2, P, P); see `GainsFit`."""
     unseen = platform.element_sigma**2 / platform.n
-    sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
+    pairs = np.stack([exchanges.receiver[used], len(logs[0]) + exchanges.transmitter[used]], axis=1)
+    sigmas = [_sigmas(pairs, covariance, logs.shape, unseen) for covariance in covariances]
     own, shared = np.max(sigmas, axis=0)
     factors = np.clip(np.exp(logs), *GAIN_RANGE)
     gains = []
     for k, (sensor, emitter) in enumerate(zip(*factors.tolist(), strict=True)):
         is_surer = max(own[k], shared[k]) < platform.element_sigma
-        sigma, common_sigma = max(float(own[k]), _MIN_SIGMA), float(shared[k])
-        found = (tuple(sensor), tuple(emitter), sigma, common_sigma)
+        found = (tuple(sensor), tuple(emitter), max(float(own[k]), _MIN_SIGMA), float(shared[k]))
         gains.append(IrGains(*found) if is_surer else IrGains.unknown(platform))
     return tuple(gains)
 
 
-def _sigmas(
-    exchanges: Exchanges,
-    covariance: FloatArray,
-    shape: tuple[int, ...],
-    unseen: float,
-    used: NDArray[np.bool_],
-) -> FloatArray:
+def _sigmas(pairs: IntArray, covariance: FloatArray, shape: tuple[int, ...], unseen: float) -> FloatArray:
     """Standard deviations (2, robots) of log-gains: individual, and common to all elements of a robot.
 
     The common variance of a receiver's sensors and a transmitter's emitters is divided equally between them,
@@ -298,7 +279,6 @@ def _sigmas(
     means = blocks.mean(axis=(1, 3))
     own = np.array([np.trace(blocks[k, :, k]) / n - means[k, k] for k in range(2 * robots)])
     common: list[list[float]] = [[] for _ in range(2 * robots)]
-    pairs = np.stack([exchanges.receiver[used], robots + exchanges.transmitter[used]], axis=1)
     for sensors, emitters in np.unique(pairs, axis=0).tolist():
         both = means[sensors, sensors] + means[emitters, emitters] + 2.0 * means[sensors, emitters]
         common[sensors].append(0.5 * float(both))

@@ -124,18 +124,8 @@ def _solve_at(
     out: IrSolutions,
     k: int,
 ) -> None:
-    pair = Pair(
-        readings[k],
-        work.cut,
-        work.stable,
-        work.kinds,
-        work.exact,
-        gains.sensor[k],
-        gains.emitter[k],
-        work.prior,
-        models.table.ranges[0],
-        2.0 * models.table.ranges[-1],
-    )
+    costs, ranges = (readings[k], work.cut, work.stable, work.kinds, work.exact), models.table.ranges
+    pair = Pair(*costs, gains.sensor[k], gains.emitter[k], work.prior, ranges[0], 2.0 * ranges[-1])
     for side in range(2):  # the information of the prior on the log-gains of sensors, and of emitters
         own, common = max(gains.sigma[k, 2 * side], _EXACT) ** 2, gains.sigma[k, 2 * side + 1] ** 2
         work.prior[side, 0], work.prior[side, 1] = 1.0 / own, common / (own + pair.sensor.size * common)
@@ -302,23 +292,14 @@ def _list_starts(models: Models, pair: Pair, work: Workspace) -> int:
     starts, found = work.starts, work.starts[1 : 1 + TABLE_STARTS]
     outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
     count = 1 + find_starts(models.table, work.pattern, work.present, outliers, work.start, found)
-    _search_blurred(models.blurred, pair, work, found[0])
+    soft = Pair(*pair[:4], work.soft, *pair[5:])  # type: ignore[arg-type] # mypy loses the order
+    write_costs(models.blurred.errors, soft)
+    search(models.blurred, soft, found[0], _LOOSE, work.plain, work.minima[0])
+    for c in range(3):
+        starts[0, c] = work.plain.at[c]
     while starts[count - 1, 3] > _WORSE * starts[1, 3]:
         count -= 1
     return count
-
-
-@norefcount_njit
-def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArray) -> None:
-    """Write the minimum of the blurred model as the first start."""
-    p = pair
-    soft = Pair(
-        p.readings, p.cut, p.stable, p.kinds, work.soft, p.sensor, p.emitter, p.prior, p.nearest, p.farthest
-    )
-    write_costs(model.errors, soft)
-    search(model, soft, start, _LOOSE, work.plain, work.minima[0])
-    for c in range(3):
-        work.starts[0, c] = work.plain.at[c]
 
 
 @norefcount_njit

@@ -18,13 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import assign_matrix, wrap
-from swarm_loc_estimator.infrared.brightness import (
-    Float32Array,
-    StartTable,
-    StartWorkspace,
-    compress,
-    new_start_workspace,
-)
+from swarm_loc_estimator.infrared import brightness
 from swarm_loc_estimator.infrared.cost import (
     MEASURED,
     MISSING,
@@ -70,15 +64,10 @@ class IrSolutions(NamedTuple):
 @cached_njit
 def no_solutions(count: int) -> IrSolutions:
     """Solutions of `count` pairs, all without a pose."""
-    return IrSolutions(
-        np.full((count, 3), np.nan),
-        np.full((count, 3, 3), np.nan),
-        np.zeros(count, np.int64),
-        np.full((count, 3), np.nan),
-        np.zeros(count),
-        np.full((count, 3), np.nan),
-        np.full(count, np.nan),
-    )
+    poses, alternatives, shares = np.full((3, count, 3), np.nan)
+    covariances, misfits = np.full((count, 3, 3), np.nan), np.full(count, np.nan)
+    outcomes, odds = np.zeros(count, np.int64), np.zeros(count)
+    return IrSolutions(poses, covariances, outcomes, alternatives, odds, shares, misfits)
 
 
 class ReadingsError(ValueError):
@@ -96,15 +85,12 @@ def checked(
     values = np.ascontiguousarray(readings, dtype=np.float64)
     wanted = (len(platform.amplitudes), platform.n, platform.n)
     if values.ndim != 4 or values.shape[1:] != wanted:
-        raise ReadingsError(
-            f"readings have the shape {values.shape} but must have"
-            f" (pairs, {wanted[0]}, {wanted[1]}, {wanted[2]})."
-        )
+        must = f"(pairs, {wanted[0]}, {wanted[1]}, {wanted[2]})"
+        raise ReadingsError(f"readings have the shape {values.shape} but must have {must}.")
     known = platform.unknown_gains(len(values)) if gains is None else gains
     if known.sensor.shape != (len(values), platform.n):
-        raise ReadingsError(
-            f"gains have the shape {known.sensor.shape} but must have {(len(values), platform.n)}."
-        )
+        must = f"{(len(values), platform.n)}"
+        raise ReadingsError(f"gains have the shape {known.sensor.shape} but must have {must}.")
     if saturation is None:
         return values, known, np.full(values.shape[:2], platform.saturation)
     limits = np.ascontiguousarray(saturation, dtype=np.float64)
@@ -121,10 +107,10 @@ class Workspace(NamedTuple):
 
     plain: CostWorkspace  # For a search over only the pose
     full: CostWorkspace  # Includes the gains where they are unknown, else `plain`
-    start: StartWorkspace  # Of the search for starts
+    start: brightness.StartWorkspace  # Of the search for starts
     starts: FloatArray  # (S, 4) range, bearing, heading, misfit
-    pattern: Float32Array  # (F,) compressed readings
-    present: Float32Array  # (F,) 1 where there is a reading, else 0
+    pattern: brightness.Float32Array  # (F,) compressed readings
+    present: brightness.Float32Array  # (F,) 1 where there is a reading, else 0
     cut: FloatArray  # (F,) of `Pair`
     stable: FloatArray  # (F,) of `Pair`
     kinds: NDArray[np.int8]  # (F,) of `Pair`
@@ -139,40 +125,37 @@ class Workspace(NamedTuple):
 
 
 @cached_njit
-def new_workspace(table: StartTable, modes: int, n: int, known: bool) -> Workspace:
+def new_workspace(table: brightness.StartTable, modes: int, n: int, known: bool) -> Workspace:
     """Memory for one platform; `known`: whether gains are known."""
     plain = new_cost_workspace(modes, n, False)
     full = plain if known else new_cost_workspace(modes, n, True)
     readings = modes * n * n
-    return Workspace(
+    pattern, present = np.empty(readings, np.float32), np.empty(readings, np.float32)
+    cut, stable = np.empty(readings), np.empty(readings)
+    searches = (
         plain,
         full,
-        new_start_workspace(table),
+        brightness.new_start_workspace(table),
         np.empty((1 + TABLE_STARTS, 4)),
-        np.empty(readings, np.float32),
-        np.empty(readings, np.float32),
-        np.empty(readings),
-        np.empty(readings),
-        np.empty(readings, np.int8),
-        new_costs(readings),
-        new_costs(readings),
-        np.empty((2, 2)),
-        np.empty((2, 4)),
-        np.empty(full.at.size),
-        np.empty(full.at.size),
-        np.empty(4),
-        np.empty((3, 3)),
+        pattern,
+        present,
     )
+    costs = cut, stable, np.empty(readings, np.int8), new_costs(readings), new_costs(readings)
+    best, found = np.empty(full.at.size), np.empty(full.at.size)
+    minima = np.empty((2, 2)), np.empty((2, 4)), best, found, np.empty(4), np.empty((3, 3))
+    return Workspace(*searches, *costs, *minima)
 
 
 @norefcount_njit
-def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present: Float32Array) -> None:
+def compress_readings(
+    model: IrModel, pair: Pair, pattern: brightness.Float32Array, present: brightness.Float32Array
+) -> None:
     """Write the readings divided by the gains and compressed as in the table."""
     n = pair.sensor.size
     for f in range(pair.kinds.size):
         there = pair.kinds[f] != MISSING
         gain = pair.sensor[f // n % n] * pair.emitter[f % n]
-        pattern[f] = compress(model, pair.readings[f] / gain) if there else 0.0
+        pattern[f] = brightness.compress(model, pair.readings[f] / gain) if there else 0.0
         present[f] = 1.0 if there else 0.0
 
 
@@ -180,13 +163,8 @@ def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present
 def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, int, float]:
     """Write `cut`, `stable`, `kinds`; returns the numbers of measured and saturated readings, and brightness.
 
-    Args:
-        model: Of the platform.
-        saturation: (modes,) minimum of SATURATED readings [count].
-        pair: The readings.
-
-    Returns:
-        The brightness is the sum of squared readings in sigmas.
+    Of SATURATED readings, `saturation` (modes,) is the minimum [count]. The brightness is the sum of squared
+    readings in sigmas.
     """
     n, measured, saturated, bright = pair.sensor.size, 0, 0, 0.0
     for f in range(pair.kinds.size):
@@ -313,11 +291,8 @@ def _step(
 def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
     """Cholesky factorization with a damped diagonal; returns whether the matrix is positive definite.
 
-    Args:
-        matrix: (P, P); the lower triangle is used.
-        damping: Relative increase of the diagonal.
-        factor: (P, P) written.
-        held: Whether to leave out the range, the third last row and column.
+    Of the matrix (P, P) the lower triangle is used. `held` leaves out the range, its third last row and
+    column.
     """
     size = matrix.shape[0]
     for p in range(size):
@@ -394,12 +369,16 @@ def _write_share_of_gains(pair: Pair, work: CostWorkspace) -> None:
     x, n, row = work.at.size - 3, pair.sensor.size, work.step
     for p in range(3):
         work.of_gains[p] = 0.0
-        if x == 0:
-            work.of_gains[p] = _systematic_share(work, p)
-            continue
         for q in range(row.size):
             row[q] = 1.0 if q == x + p else 0.0
         _solve(work.factor, row)
+        if x == 0:
+            part = 0.0
+            for a in range(3):
+                for b in range(3):
+                    part += row[a] * work.systematic[a, b] * row[b]
+            work.of_gains[p] = part / row[p]
+            continue
         for side in range(2):
             squares, total = 0.0, 0.0
             for q in range(side * n, side * n + n):
@@ -407,19 +386,6 @@ def _write_share_of_gains(pair: Pair, work: CostWorkspace) -> None:
                 total += row[q]
             part = pair.prior[side, 0] * (squares - pair.prior[side, 1] * total * total)
             work.of_gains[p] += part / row[x + p]
-
-
-@norefcount_njit
-def _systematic_share(work: CostWorkspace, p: int) -> float:
-    """Share of the variance of the pose's component p that comes from systematic noise."""
-    row, part = work.step, 0.0
-    for q in range(3):
-        row[q] = 1.0 if q == p else 0.0
-    _solve(work.factor, row)
-    for a in range(3):
-        for b in range(3):
-            part += row[a] * work.systematic[a, b] * row[b]
-    return float(part / row[p])
 
 
 @norefcount_njit

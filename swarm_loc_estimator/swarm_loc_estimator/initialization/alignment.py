@@ -12,19 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common import numerics, se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.numerics import (
-    assign,
-    assign_matrix,
-    carry,
-    cholesky3,
-    composed,
-    moved_by_twist,
-    solve3,
-    wrap,
-)
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
 from swarm_loc_estimator.initialization.window import Window
@@ -79,18 +69,6 @@ def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[flo
 
 
 @cached_njit
-def _spread_around(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3).
-
-    A circle about that ellipse where the heading is so unknown that errors lie on arcs.
-    """
-    xx = spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2]
-    xy = spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2]
-    yy = spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2]
-    return (xx + yy, 0.0, xx + yy) if spread[2, 2] > _ARC else (xx, xy, yy)
-
-
-@cached_njit
 def _describe(window: Window, robot: int, belief: BeliefArrays, out: ConstraintArray) -> int:
     """Write the constraints of a window (m,), see `constraints_of`; return their number."""
     one, count = window.measured, 0
@@ -112,10 +90,12 @@ def _describe(window: Window, robot: int, belief: BeliefArrays, out: ConstraintA
         elif mark >= 0:
             frame = belief.landmark[mark]
         at = window.other_track[k]
-        bx, by, btheta = composed(frame[0], frame[1], frame[2], at[0], at[1], at[2])
+        bx, by, btheta = numerics.composed(frame[0], frame[1], frame[2], at[0], at[1], at[2])
         on_track, on_map = (sensor, marker) if sees else (marker, sensor)
-        lx, ly, ltheta = composed(track[0], track[1], track[2], on_track[0], on_track[1], on_track[2])
-        mx, my, mtheta = composed(bx, by, btheta, on_map[0], on_map[1], on_map[2])
+        lx, ly, ltheta = numerics.composed(
+            track[0], track[1], track[2], on_track[0], on_track[1], on_track[2]
+        )
+        mx, my, mtheta = numerics.composed(bx, by, btheta, on_map[0], on_map[1], on_map[2])
         if sees:
             ltheta += camera[0]
         else:
@@ -143,7 +123,7 @@ def _describe(window: Window, robot: int, belief: BeliefArrays, out: ConstraintA
             constraint.turn = mtheta - ltheta - sign * value[2]
         if one.has_second[k]:
             constraint.other_turn = mtheta - ltheta - sign * one.second[k, 2]
-        assign_matrix(constraint.track_noise, window.noise[k])
+        numerics.assign_matrix(constraint.track_noise, window.noise[k])
         # The error of the other side, and the drift of its track since.
         constraint.column = column
         for i in range(3):
@@ -153,11 +133,17 @@ def _describe(window: Window, robot: int, belief: BeliefArrays, out: ConstraintA
                 if other >= 0:
                     drift[i, j] = window.other_noise[k, i, j] - belief.preintegrated_covariance[other, i, j]
         later = 1.0 if drift[0, 0] + drift[1, 1] + drift[2, 2] > 0.0 else -1.0
-        carry(frame, drift, spread)
+        numerics.carry(frame, drift, spread)
         for i in range(3):
             for j in range(3):
                 spread[i, j] = constraint.shared[i, j] + later * spread[i, j]
-        at_xx, at_xy, at_yy = _spread_around(spread, constraint.map_x, constraint.map_y)
+        # At the point: a circle about this ellipse where the heading is so unknown that errors lie on arcs.
+        x, y = constraint.map_x, constraint.map_y
+        at_xx = spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2]
+        at_xy = spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2]
+        at_yy = spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2]
+        if spread[2, 2] > _ARC:
+            at_xx, at_xy, at_yy = at_xx + at_yy, 0.0, at_xx + at_yy
         constraint.map_xx, constraint.map_xy = there * xx + at_xx, there * xy + at_xy
         constraint.map_yy = there * yy + at_yy
         constraint.turn_variance = covariance[2, 2] + spread[2, 2]
@@ -183,10 +169,8 @@ def align(
 ) -> InitialPose | None:
     """The transform on which a robot's constraints (k,) agree; None while it is ambiguous or uncertain.
 
-    Args:
-        constraints: Of CONSTRAINT_DTYPE.
-        track_noise: (3, 3) covariance of the track preintegrated until now.
-        heading_sigma: Largest standard deviation of the heading [rad].
+    `track_noise` (3, 3) is the covariance of the track preintegrated until now, `heading_sigma` the largest
+    standard deviation of the heading [rad].
     """
     if constraints.size < MIN_CONSTRAINTS:
         return None
@@ -197,7 +181,7 @@ def align(
     best = int(np.argmax(support)) if support.size else -1
     if best < 0 or agreeing[best] < enough:
         return None
-    transform, covariance, weight = _refined(constraints, hypotheses[best])
+    transform, covariance, weight = found = _refined(constraints, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
     # errors that do not average out count whole: those of other robots, as if they were one, and the drift
@@ -214,18 +198,17 @@ def align(
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
     if _is_ambiguous(constraints, transform, rivals, limits):
         return None
-    return _split_errors(constraints, track_noise, weight, transform, covariance)
+    return _split_errors(constraints, track_noise, *found)
 
 
 def _is_ambiguous(
     constraints: ConstraintArray, transform: FloatArray, rivals: FloatArray, limits: tuple[float, float]
 ) -> bool:
-    """Whether any of the rivals (h, 3), once refined, differs from a transform (3,) by more than the limits.
-
-    The rival farthest from all examined ones comes next, because near ones converge to the same transform.
-    """
+    """Whether any of the rivals (h, 3), once refined, differs from a transform (3,) beyond the limits."""
     apart = _apart(constraints, transform, rivals, limits)
-    for _ in range(_MAX_RIVALS):
+    for _ in range(
+        _MAX_RIVALS
+    ):  # the one farthest from all before, since near ones converge to one transform
         farthest = int(np.argmax(apart))
         if apart[farthest] <= 1.0:
             return False
@@ -239,22 +222,12 @@ def _is_ambiguous(
 def _apart(
     constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
-    """Differences (h,) of transforms (h, 3) from one (3,), in units of the limits [m, rad].
-
-    The larger one of the distance at the centre of the constraints and of the angle.
-    """
+    """Differences (h,) of transforms (h, 3) from one (3,), at the centre or in angle, over their limits."""
     centre = np.array([constraints["local_x"].mean(), constraints["local_y"].mean(), 0.0])
     away = (se2.compose(others, centre) - se2.compose(one, centre))[:, :2]
     turn = np.abs(se2.wrap_angle(others[:, 2] - one[2]))
     apart: FloatArray = np.maximum(np.hypot(*away.T) / limits[0], turn / limits[1])
     return apart
-
-
-def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Transform (3,), covariance (3, 3) and weights (k,) by least squares, see `_refine`."""
-    transform, covariance, weight = np.empty(3), np.empty((3, 3)), np.empty(constraints.size)
-    _refine(constraints, begin, transform, covariance, weight)
-    return transform, covariance, weight
 
 
 @cached_njit
@@ -287,7 +260,7 @@ def _hypotheses(constraints: ConstraintArray) -> FloatArray:
 def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatArray, h: int) -> int:
     """Write the transform h with heading `turn` that maps a point of the track to its place on the map."""
     cos, sin = math.cos(turn), math.sin(turn)
-    out[h, 0], out[h, 1], out[h, 2] = mx - cos * lx + sin * ly, my - sin * lx - cos * ly, wrap(turn)
+    out[h, 0], out[h, 1], out[h, 2] = mx - cos * lx + sin * ly, my - sin * lx - cos * ly, numerics.wrap(turn)
     return h + 1
 
 
@@ -324,7 +297,7 @@ def _misses(
 @cached_njit
 def _turn_off(constraint: Constraint, heading: float) -> float:
     """Residual of a heading against a constraint's or its mirrored one, the smaller; NaN beyond 3 sigma."""
-    turn, other = wrap(constraint.turn - heading), wrap(constraint.other_turn - heading)
+    turn, other = numerics.wrap(constraint.turn - heading), numerics.wrap(constraint.other_turn - heading)
     if abs(other) < abs(turn):  # false for NaN, which means not measured
         turn = other
     return turn if turn * turn < 9.0 * constraint.turn_variance else math.nan
@@ -349,25 +322,16 @@ def _vote(
 
 
 @cached_njit
-def _refine(
-    constraints: ConstraintArray,
-    begin: FloatArray,
-    transform: FloatArray,
-    covariance: FloatArray,
-    weight: FloatArray,
-) -> None:
-    """Gauss-Newton on the points and headings that agree with a transform.
+def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Gauss-Newton on the points and headings that agree with a transform (3,).
 
-    Args:
-        constraints: (k,).
-        begin: (3,) initial transform.
-        transform: (3,) written.
-        covariance: (3, 3) written, of its right-invariant error.
-        weight: (k,) written: information of the points, zero for those that do not agree.
+    Returns:
+        The transform (3,), the covariance (3, 3) of its right-invariant error, and the information (k,) of
+        the points, zero for those that do not agree.
     """
+    transform, covariance, weight = begin.copy(), np.empty((3, 3)), np.empty(constraints.size)
     information, factor = np.empty((3, 3)), np.empty((3, 3))
     gradient, step = np.empty(3), np.empty(3)
-    assign(transform, begin)
     squared, agreeing = 0.0, 0
     for iteration in range(_REFINEMENTS):
         # Normal equations of the points and headings that agree now.
@@ -400,24 +364,25 @@ def _refine(
                 gradient[2] += turn / constraint.turn_variance
                 information[2, 2] += 1.0 / constraint.turn_variance
         # Gauss-Newton step on the manifold.
-        factor = cholesky3(information)
-        solve3(factor, gradient, step)
-        x, y, heading = moved_by_twist(step[0], step[1], step[2], x, y, heading)
+        factor = numerics.cholesky3(information)
+        numerics.solve3(factor, gradient, step)
+        x, y, heading = numerics.moved_by_twist(step[0], step[1], step[2], x, y, heading)
         transform[0], transform[1], transform[2] = x, y, heading
     # Covariance, wider where residuals exceed what is described.
     excess = max(1.0, squared / max(1, 2 * agreeing - 3))
     for i in range(3):
         for j in range(3):
             gradient[j] = excess if i == j else 0.0
-        solve3(factor, gradient, covariance[i])
+        numerics.solve3(factor, gradient, covariance[i])
+    return transform, covariance, weight
 
 
 def _split_errors(
     constraints: ConstraintArray,
     track_noise: FloatArray,
-    weight: FloatArray,
     transform: FloatArray,
     covariance: FloatArray,
+    weight: FloatArray,
 ) -> InitialPose:
     """Split the error of a transform (3,) into its own part and those of the robots that it depends on.
 

@@ -71,11 +71,7 @@ class Initializer:
         self._window_ns = int(window_s * 1e9)
 
     def note(self, state: SwarmState, one: Measurements) -> bool:
-        """Keep a measurement that ties a waiting robot to something located; enough of them locate it.
-
-        Returns:
-            Whether the measurement does so.
-        """
+        """Keep a measurement if it ties a waiting robot to something located; enough of them locate it."""
         observer, target, now_ns = int(one.observer), int(one.target), int(one.stamp_ns)
         knows_observer, knows_target = state.is_known(observer), state.is_known(target)
         robot, other = (target, observer) if knows_observer else (observer, target)
@@ -250,9 +246,8 @@ class LocalFrame:
                 if not state.tracked.any():
                     self.leave(state, int(measurements.stamp_ns[end - 1]))
             else:
-                end = begin + self._first_local(
-                    state, select(measurements, slice(begin, None)), absolute[begin:]
-                )
+                rest = select(measurements, slice(begin, None))
+                end = begin + self._first_local(state, rest, absolute[begin:])
                 if end > begin:
                     yield slice(begin, end), False
                 if end < measurements.size and not state.tracked.any():
@@ -263,10 +258,7 @@ class LocalFrame:
         return self._is_wanted and not state.tracked.any()
 
     def _first_local(self, state: SwarmState, measurements: Measurements, absolute: BoolArray) -> int:
-        """Index of the first measurement (of m) that a local frame may use; m if none.
-
-        Notes which robots have met.
-        """
+        """Note which robots have met; index of the first measurement (of m) for a local frame, m if none."""
         if not self._may_begin(state):
             return measurements.size
         for k, stamp_ns in enumerate(measurements.stamp_ns.tolist()):
@@ -295,11 +287,7 @@ class LocalFrame:
         state.origin, state.meetings = robot, Meetings()
 
     def collect(self, state: SwarmState, one: Measurements) -> bool:
-        """Keep an absolute measurement of a swarm in a local frame; enough of them move it to `map`.
-
-        Returns:
-            Whether the measurement does so.
-        """
+        """Keep an absolute measurement of a swarm in a local frame, if it is one; enough move it to `map`."""
         robot = int(max(one.observer, one.target))
         if not self._tracks.has_started(robot, int(one.stamp_ns)):
             return False
@@ -311,7 +299,7 @@ class LocalFrame:
         robot: int,
         initial: InitialPose,
         at: Preintegrated,
-        confirmations: float = CONFIRMED,
+        confirmed: float = CONFIRMED,
     ) -> None:
         """Move all robots to `map` with a robot whose pose there is known.
 
@@ -323,7 +311,7 @@ class LocalFrame:
             state.move(robot, initial)
         else:
             self.leave(state, at.stamp_ns)
-            state.initialize(robot, initial, at, confirmations)
+            state.initialize(robot, initial, at, confirmed)
 
     @staticmethod
     def leave(state: SwarmState, stamp_ns: int) -> None:

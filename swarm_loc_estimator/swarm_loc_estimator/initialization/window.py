@@ -116,8 +116,7 @@ class _Fit(NamedTuple):
     @property
     def squared(self) -> FloatArray:
         """Squared residuals (m,) in units of their variances."""
-        squared: FloatArray = np.square(self.residual) / self.variance
-        return squared
+        return np.asarray(np.square(self.residual) / self.variance)
 
     @property
     def cost(self) -> FloatArray:
@@ -138,13 +137,9 @@ class _Hypothesis(NamedTuple):
 
 
 class Problem:
-    """Least squares for the transform of a waiting robot's track.
+    """Least squares for the transform of a waiting robot's track, by rows (m,) with localized sides in order.
 
-    Args:
-        state: Poses and covariances of the localized sides.
-        robot: The waiting robot.
-        window: (m,) rows between it and localized sides, in order of time.
-        noise: (3, 3) preintegrated covariance of its track until now.
+    `noise` (3, 3) is the preintegrated covariance of its track until now.
     """
 
     def __init__(self, state: SwarmState, robot: int, window: Window, noise: FloatArray) -> None:
@@ -268,10 +263,8 @@ class Problem:
         """Whether a rival hypothesis is much worse than the best one, also without any one of the links."""
         more = rival.cost - best.cost
         by_link = np.bincount(self._link, weights=more)
-        total = float(more.sum())
-        return total > _MARGIN and (
-            by_link.size < _MIN_LINKS or total - float(by_link.max()) > _MARGIN_WITHOUT
-        )
+        total, most = float(more.sum()), float(by_link.max())
+        return total > _MARGIN and (by_link.size < _MIN_LINKS or total - most > _MARGIN_WITHOUT)
 
     def solution(self, transform: FloatArray) -> InitialPose | None:
         """Generalized least squares with the rows that agree with a transform (3,); None: singular.
@@ -283,9 +276,8 @@ class Problem:
             good = fit.squared < _TRUNCATED
             own, other, column = fit.jacobian[good], fit.other_jacobian[good], self._column[good]
             on_track = own @ se2.adjoint(transform)
-            alone = np.diag(
-                self._window.measured.covariance[good, 0, 0] + _within(other, self._other_drift[good])
-            )
+            own_variance = self._window.measured.covariance[good, 0, 0]
+            alone = np.diag(own_variance + _within(other, self._other_drift[good]))
             upper = np.triu(np.einsum("ka,lab,lb->kl", on_track, self._drift[good], on_track))
             alone = alone + upper + np.triu(upper, 1).T + self._bias_covariance[np.ix_(good, good)]
             common = np.zeros_like(alone)
@@ -314,14 +306,10 @@ class Problem:
 def locate(
     state: SwarmState, robot: int, window: Window, noise: FloatArray, heading_sigma: float
 ) -> InitialPose | None:
-    """The transform of a waiting robot's track; None while it is ambiguous or uncertain.
+    """The transform of a waiting robot's track by its measurements (m,); None while ambiguous or uncertain.
 
-    Args:
-        state: Poses of the others.
-        robot: The waiting robot.
-        window: (m,) its measurements.
-        noise: (3, 3) preintegrated covariance of the track until now.
-        heading_sigma: Largest standard deviation of the heading [rad].
+    `noise` (3, 3) is the preintegrated covariance of the track until now, `heading_sigma` the largest
+    standard deviation of the heading [rad].
     """
     rows = window.measured
     known = np.append(state.tracked, True)  # index NOBODY (-1) selects the last element
@@ -336,10 +324,16 @@ def locate(
     found: list[_Hypothesis] = []
     for rough in _distinct(whole, begun):
         found.append(whole.descend(rough.transform, _STEPS))
-        if len(found) == 1 and not _is_observed(found[0].fit):
+        weighted = found[0].fit.jacobian / np.sqrt(found[0].fit.variance)[:, None]
+        if not np.linalg.cond(weighted.T @ weighted) < 1e12:  # not observed, as while a robot stands
             return None
     best, *rivals = _distinct(whole, found)
-    if not _is_agreed(best.fit, window):
+    # Does enough of the window agree, as well as its noise allows?
+    squared, has_many_links = best.fit.squared, np.unique(links(window)).size >= _MIN_LINKS
+    least = max(_MIN_ROWS, (_MIN_SHARE if has_many_links else _FEW_SHARE) * window.size)
+    is_long = has_many_links or np.ptp(window.measured.stamp_ns) >= _FEW_NS
+    agreeing = squared[squared < _TRUNCATED]
+    if not (is_long and agreeing.size >= least and agreeing.mean() <= _MAX_EXCESS):
         return None
     if not all(whole.is_beaten(best.fit, rival.fit) for rival in rivals):
         return None
@@ -349,15 +343,6 @@ def locate(
     x, y, heading = np.sqrt(np.diag(whole.covariance(initial))).tolist()
     is_sure = max(x, y) < _POSITION_SIGMA and heading < heading_sigma
     return initial if is_sure else None
-
-
-def _is_agreed(fit: _Fit, window: Window) -> bool:
-    """Whether enough of a window agrees with a hypothesis, and as well as its noise allows."""
-    agrees = fit.squared < _TRUNCATED
-    has_many_links = np.unique(links(window)).size >= _MIN_LINKS
-    least = max(_MIN_ROWS, (_MIN_SHARE if has_many_links else _FEW_SHARE) * window.size)
-    is_long = has_many_links or np.ptp(window.measured.stamp_ns) >= _FEW_NS
-    return bool(is_long and agrees.sum() >= least and fit.squared[agrees].mean() <= _MAX_EXCESS)
 
 
 def _distinct(problem: Problem, found: list[_Hypothesis]) -> list[_Hypothesis]:
@@ -371,12 +356,6 @@ def _distinct(problem: Problem, found: list[_Hypothesis]) -> list[_Hypothesis]:
     return chosen
 
 
-def _is_observed(fit: _Fit) -> bool:
-    """Whether the rows determine a transform at all, as they do not while a robot stands."""
-    weighted = fit.jacobian / np.sqrt(fit.variance)[:, None]
-    return bool(np.linalg.cond(weighted.T @ weighted) < 1e12)
-
-
 def _robust_cost(fit: _Fit) -> float:
     """Sum of Cauchy costs."""
     squared = np.minimum(fit.squared, 1e12)
@@ -386,5 +365,4 @@ def _robust_cost(fit: _Fit) -> float:
 def _within(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """Variances (m,) of a component with Jacobians (m, 3) and covariances (m, 3, 3) or (3, 3)."""
     each = np.broadcast_to(covariance, (len(jacobian), 3, 3))
-    variance: FloatArray = np.einsum("ma,mab,mb->m", jacobian, each, jacobian)
-    return variance
+    return np.asarray(np.einsum("ma,mab,mb->m", jacobian, each, jacobian))

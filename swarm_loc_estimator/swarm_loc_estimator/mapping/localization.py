@@ -340,11 +340,7 @@ class LightBook:
 
 
 def _median(ratio: float, turn: FloatArray, bearing: FloatArray) -> tuple[float, float]:
-    """The turn by odometry, and median at this turn, of bearings (n,) of a light at turns (n,) by odometry.
-
-    Where wheels slip, a robot that turns by more than a full turn sees the light again after more than a full
-    turn by odometry. So the bearing belongs to the turn of one sighting, not to any turn with its direction.
-    """
+    """The turn by odometry, and median there, of bearings (n,) of a light: wheels slip, so of one passage."""
     off = wrap_angle(ratio * (turn - turn[0]) + bearing - bearing[0])
     middle = int(np.argsort(off, kind="stable")[len(off) // 2])
     passes = np.abs(turn - turn[middle]) < math.pi

@@ -183,11 +183,7 @@ def _is_dense(data: bytes, head: re.Match[bytes]) -> bool:
 
 
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Gray values (height, width) of an image as map_server writes it, and which pixels are opaque.
-
-    Raises:
-        UserError: It cannot be read, is too large, or is no PGM, PPM, PBM, PNG or BMP.
-    """
+    """Gray values (height, width) of an image, and which pixels are opaque; raises UserError."""
     from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     data = read_file(path, _MAX_BYTES)

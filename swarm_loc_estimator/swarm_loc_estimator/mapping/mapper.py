@@ -321,6 +321,7 @@ class CooperativeMapper:
         """Solve the whole graph with all beams."""
         for track in self._tracks.values():
             self._update_scan(track)
+        self.sweeps.refine()
         align_all(self.graph)
         self._map = None
 

@@ -235,7 +235,7 @@ class NormalFactor:
         return np.asarray(0.5 * (covariance + covariance.T))
 
 
-class _Rows:
+class PairRows:
     """Constraints of one kind in order of insertion: two stops, and numbers.
 
     Args:
@@ -250,7 +250,7 @@ class _Rows:
     def add(self, begin: int, end: int, *values: FloatArray | float) -> None:
         """Add one."""
         if self.count == len(self._stops):
-            self._stops, self._values = _doubled(self._stops), _doubled(self._values)
+            self._stops, self._values = doubled(self._stops), doubled(self._values)
         self._stops[self.count] = begin, end
         self._values[self.count] = np.hstack(values)
         self.count += 1
@@ -272,7 +272,7 @@ class ConstraintLists:
     """Priors, odometry, ties and bearings in order of insertion."""
 
     def __init__(self) -> None:
-        self._priors, self._departures, self._ties, self._bearings = map(_Rows, (6, 7, 12, 3))
+        self._priors, self._departures, self._ties, self._bearings = map(PairRows, (6, 7, 12, 3))
 
     def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
         """Add a prior on the pose (3,) of a stop with standard deviations (3,)."""
@@ -597,13 +597,13 @@ class PoseGraph:
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
 
     def _grow(self) -> None:
-        self.states, self.robot, self.place = map(_doubled, (self.states, self.robot, self.place))
-        self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
-        self._fitted_ratio = _doubled(self._fitted_ratio)
-        self._beams = Beams(*(_doubled(one) for one in self._beams))
-        self._lines = Lines(*(_doubled(one) for one in self._lines))
+        self.states, self.robot, self.place = map(doubled, (self.states, self.robot, self.place))
+        self.turned, self._turned_all = doubled(self.turned), doubled(self._turned_all)
+        self._fitted_ratio = doubled(self._fitted_ratio)
+        self._beams = Beams(*(doubled(one) for one in self._beams))
+        self._lines = Lines(*(doubled(one) for one in self._lines))
 
 
-def _doubled(array: Any) -> Any:
+def doubled(array: Any) -> Any:
     """The array with twice the length, padded with zeros."""
     return np.concatenate([array, np.zeros_like(array)])

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -28,7 +29,7 @@ from swarm_loc_estimator.mapping.correlation import (
     thin,
 )
 from swarm_loc_estimator.mapping.grid import DrawnSweep
-from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.pose_graph import PairRows, PoseGraph, doubled
 from swarm_loc_estimator.mapping.scans import MAX_BEAMS, ScanStop
 
 # The constants were chosen on freiburg-101, acapulco and intel, `_LOOK_EVERY` by the cost in freiburg-079.
@@ -76,6 +77,7 @@ _DOUBT_EVERY, _DOUBT_NEAR, _DOUBT_SHARE, _DOUBT_APART = 4, 1.0, 0.6, 2.0
 have, and distance of places [m]."""
 _TORN_M, _TORN_TURN = 0.25, math.radians(5.0)  # Offset from which a place is torn, and no wall just blurred
 _DOUBT_WINDOW = PoseWindow(1.0, math.radians(10.0), math.inf, math.inf)
+_REFINED = PoseWindow(0.35, math.radians(4.0), math.inf, math.inf)  # Search of `SweepMap.refine`
 _UNTIED_M = 1.0  # Way that counts for a sweep that fits nothing [m], and three times its path
 
 
@@ -122,9 +124,9 @@ class _Points:
     def set(self, node: int, points: FloatArray) -> None:
         """Set the points (n, 2) of a node."""
         while node >= len(self.counts):
-            self._first, self.counts, self.middle = map(_doubled, (self._first, self.counts, self.middle))
+            self._first, self.counts, self.middle = map(doubled, (self._first, self.counts, self.middle))
         while self._used + len(points) > len(self._points):
-            self._points = _doubled(self._points)
+            self._points = doubled(self._points)
         self._points[self._used : self._used + len(points)] = points
         self._first[node], self.counts[node] = self._used, len(points)
         self._used += len(points)
@@ -140,33 +142,23 @@ class _GraphWays:
     """Ways through the graph: edges of which the length says how much two stops may be off."""
 
     def __init__(self) -> None:
-        self._edges = np.zeros((64, 3))
-        self._used = 0
+        self._edges = PairRows(1)
 
     def add(self, begin: int, end: int, length: float) -> None:
         """Add an edge with a length [m]."""
-        if self._used == len(self._edges):
-            self._edges = _doubled(self._edges)
-        self._edges[self._used] = begin, end, length + 1e-3
-        self._used += 1
+        self._edges.add(begin, end, length + 1e-3)
 
     def cut(self, *stops: int) -> None:
         """Remove all edges of one stop, or those of two."""
-        edges = self._edges[: self._used]
-        edges[np.isin(edges[:, :2], stops).sum(axis=1) == len(stops), 2] = np.inf
+        begin, end, _ = self._edges.columns
+        self._edges.remove(np.isin(begin, stops).astype(int) + np.isin(end, stops) == len(stops))
 
     def lengths(self, node: int, count: int, limit: float = np.inf) -> FloatArray:
         """Lengths (count,) of the shortest ways from a stop, up to a limit [m]."""
-        edges = self._edges[: self._used]
-        edges = edges[np.isfinite(edges[:, 2])]
-        index = (edges[:, 0].astype(np.int32), edges[:, 1].astype(np.int32))
-        graph = csr_matrix((edges[:, 2], index), shape=(count, count))
+        begin, end, length = self._edges.columns
+        graph = csr_matrix((length[:, 0], (begin, end)), shape=(count, count))
         lengths: FloatArray = dijkstra(graph, directed=False, indices=node, limit=limit)
         return lengths
-
-
-def _doubled(array: Any) -> Any:
-    return np.concatenate([array, np.zeros_like(array)])
 
 
 class SweepMap:
@@ -195,6 +187,8 @@ class SweepMap:
         self._chains: defaultdict[int, Chain] = defaultdict(Chain)
         self._points, self._ways = _Points(), _GraphWays()
         self._unsolved = 0
+        self._refined: list[LoopTie] = []  # Ties of the last solution, and for how many stops and loops
+        self._refined_for = (0, 0)
 
     def begin(self, node: int, stop: ScanStop, *, floats: bool = False) -> None:
         """Note the first sweep of a robot, or the first since it was lost; `floats`: its start is unknown."""
@@ -250,7 +244,8 @@ class SweepMap:
 
     def drop(self, node: int) -> None:
         """Take back a sweep."""
-        self.drawn.pop(node, None)
+        if self.drawn.pop(node, None) is None:  # the stop of a robot with a laser pointer
+            return
         self._points.counts[node] = 0
         self._ways.cut(node)
         self.loops = [one for one in self.loops if node not in one[:2]]
@@ -276,29 +271,70 @@ class SweepMap:
         found = match(field, points, pose, _window(motion))
         return found.pose if found.score >= _MIN_SCORE else pose
 
+    def _revisits(self, nodes: IntArray, near: float) -> Iterator[tuple[int, int, FloatArray, PointField]]:
+        """Nodes whose places were seen at another time: also a sweep of then, own points, and the field."""
+        counts = self._points.counts[: self._graph.count]
+        all_nodes = np.flatnonzero(counts >= _MIN_POINTS)
+        for node in nodes.tolist():
+            is_other = counts >= _MIN_POINTS
+            is_other[max(0, node - _OLD) : node + _OLD] = False
+            off = self._middles(all_nodes) - self._middles(np.array([node]))
+            away = np.where(is_other[all_nodes], np.hypot(*off.T), np.inf)
+            if away.min(initial=np.inf) <= near:
+                other = int(all_nodes[np.argmin(away)])
+                points = self._points.at(np.array([node]), np.zeros((1, 3)))
+                yield node, other, points, self._around(other, is_other)
+
+    def refine(self) -> None:
+        """Tie all sweeps with those that saw the same at other times, where they fit best near by.
+
+        It is done twice, the second time from better poses; nothing is done if nothing is new.
+        """
+        new = self._graph.count, len(self.loops)
+        for _ in range(2 * (new != self._refined_for)):
+            self._tie_revisits()
+        self._refined_for = new
+
+    def _tie_revisits(self) -> None:
+        graph, tied = self._graph, {frozenset(one[:2]) for one in self.loops}
+        self._drop_refined(self._refined)
+        nodes = np.flatnonzero((self._points.counts[: graph.count] >= _MIN_POINTS) & ~self.floating())
+        for node, other, points, known in self._revisits(nodes, _DOUBT_NEAR):
+            found = match(known, points, graph.states[node, :3], _REFINED)
+            is_sure = found.score >= _LOOP_SCORE and _ridge(found.covariance) < _LOOP_RIDGE
+            if is_sure and frozenset((other, node)) not in tied:
+                tied.add(frozenset((other, node)))
+                there = graph.states[other, :3]
+                root = root_of(_turned(found.covariance, -there[2]))
+                self._refined.append(LoopTie(other, node, between(there, found.pose), root, 0.0))
+        for one in self._refined:
+            graph.constraints.add_tie(*one[:4])
+        if self._refined:
+            graph.solve(3)
+            self._drop_refined([one for one in self._refined if _square(one, graph.states) > _CONTRADICTS])
+
+    def _drop_refined(self, ties: list[LoopTie]) -> None:
+        for one in ties:
+            self._graph.constraints.remove_tie(one.begin, one.end)
+        self._refined = [one for one in self._refined if one not in ties]
+
     def doubts(self) -> FloatArray:
         """Places (n, 2) in map where sweeps fit nothing, or fit others elsewhere better [m]."""
         graph, count = self._graph, self._graph.count
         nodes = np.flatnonzero(self._points.counts[:count] >= _MIN_POINTS)
-        refused = [one for one in self.refused if self._points.counts[one]]
-        middles, places = self._middles(nodes), []
-        for node in sorted({*nodes[::_DOUBT_EVERY].tolist(), *refused}):
-            # the nearest sweep of another time that sees the same
-            is_other = self._points.counts[:count] >= _MIN_POINTS
-            is_other[max(0, node - _OLD) : node + _OLD] = False
-            middle = self._middles(np.array([node]))
-            away = np.where(is_other[nodes], np.hypot(*(middles - middle).T), np.inf)
-            if away.min(initial=np.inf) > (_NEAR if node in refused else _DOUBT_NEAR):
-                places += [graph.states[node, :2]] if node in refused else []
-                continue
-            # whether this one fits those around it clearly better elsewhere
-            pose, points = graph.states[node, :3].copy(), self._points.at(np.array([node]), np.zeros((1, 3)))
-            field = self._around(int(nodes[np.argmin(away)]), is_other)
-            here, best = score_at(field, points, pose), match(field, points, pose, _DOUBT_WINDOW)
-            x, y, turn = between(pose, best.pose)
-            is_apart = math.hypot(x, y) > _TORN_M or abs(turn) > _TORN_TURN
-            if is_apart and here < _GOOD and here < _DOUBT_SHARE * best.score:
-                places.append(pose[:2])
+        refused = np.array([one for one in self.refused if self._points.counts[one]], dtype=np.int64)
+        alone, places = set(refused.tolist()), []
+        for some, near in ((nodes[::_DOUBT_EVERY], _DOUBT_NEAR), (refused, _NEAR)):
+            for node, _, points, known in self._revisits(some, near):
+                alone.discard(node)
+                # whether this one fits those around it clearly better elsewhere
+                pose = graph.states[node, :3].copy()
+                here, best = score_at(known, points, pose), match(known, points, pose, _DOUBT_WINDOW)
+                x, y, turn = between(pose, best.pose)
+                is_apart = math.hypot(x, y) > _TORN_M or abs(turn) > _TORN_TURN
+                if is_apart and here < _GOOD and here < _DOUBT_SHARE * best.score:
+                    places.append(pose[:2])
+        places += [graph.states[node, :2] for node in sorted(alone)]
         kept: list[FloatArray] = []
         for place in places:
             if all(math.dist(place, one) > _DOUBT_APART for one in kept):
@@ -384,11 +420,12 @@ class SweepMap:
         nearest = near[np.argmin(away[near] - drift[near])]
         query = transform_points(inverse(graph.states[node, :3]), query)
         one = self._match_old(node, query, int(old[nearest]), float(ways[nearest]), is_old)
+        if one is None or (one.way < _SHORT and _square(one, graph.states) < _SOLVE):
+            chain.looked += _LOOK_EVERY  # the next one would say the same
         if one is None:
             return
         if one.way < _SHORT:
             self.believe([one])
-            chain.looked += _LOOK_EVERY  # the graph knew that place
         else:
             chain.pending.append(one)
             self._test_together(chain)
@@ -469,8 +506,7 @@ class SweepMap:
             _RIVAL,
             _LOOP_SCORE,
         )
-        sigma = math.sqrt(float(np.linalg.eigvalsh(found.covariance[:2, :2])[-1]))
-        if found.score < _LOOP_SCORE or found.rival or sigma > _LOOP_RIDGE:
+        if found.score < _LOOP_SCORE or found.rival or _ridge(found.covariance) > _LOOP_RIDGE:
             return None
         there = self._graph.states[old, :3]
         root = root_of(_turned(found.covariance, -there[2]))
@@ -537,6 +573,11 @@ def _window(motion: FloatArray) -> PoseWindow:
         _PREDICTED + _PREDICTED_PER_M * path,
         _PREDICTED_TURN + 0.1 * turn,
     )
+
+
+def _ridge(covariance: FloatArray) -> float:
+    """Greatest standard deviation of a position by a covariance (3, 3) [m]."""
+    return math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 def _square(tie: LoopTie, states: FloatArray) -> float:

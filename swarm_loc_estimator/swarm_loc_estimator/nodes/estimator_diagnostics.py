@@ -16,7 +16,7 @@ from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
+from swarm_loc_estimator.sensors.inputs import Ingest, InputTopic
 from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
@@ -155,13 +155,9 @@ class Diagnostics:
     ) -> list[Report]:
         """Reports of robots, of fixed cameras, of the swarm's inputs and drops; begins a new interval.
 
-        Args:
-            now_ns: The node's time.
-            estimate: The newest estimate.
-            recent: The estimator's measurements with verdicts and normalized innovations squared.
-            drops: Data not used, by reason.
-            drops_of: The same of each robot and fixed camera.
-            losses: Of each robot, why it is not located; None for others.
+        `recent` are the estimator's measurements with verdicts and normalized innovations squared, `drops`
+        what was not used by reason, `drops_of` that of each robot and fixed camera, and `losses` why robots
+        are not located; None for others.
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
@@ -183,14 +179,22 @@ class Diagnostics:
             troubles = self._duplicates_on([topic.name for _, topic in inputs])
             self.duplicate_publishers += troubles
             troubles += [loss.text(now_ns)] if loss is not None else []
-            troubles += self._drop_troubles(index, drops_of[index]) if drops_of else []
-            troubles += _unused_scans(index, recent)
+            if drops_of:
+                before, self._dropped[index] = self._dropped[index], dict(drops_of[index])
+                for reason, cause in _CAUSES.items():
+                    grown = drops_of[index].get(reason, 0) - before.get(reason, 0)
+                    troubles += [f"dropped {grown} of its data: they {cause}"] if grown else []
+            own = verdicts[(measurements.model == SCAN) & (measurements.target == index)]
+            most = Verdict(int(np.bincount(own).argmax())) if own.size else Verdict.OPEN
+            if most and not (own == Verdict.USED).any():
+                why = _UNUSED_SCANS[most]
+                troubles.append(f"none of its last {own.size} scans is used: they {why}")
             troubles += [clocks_apart[index].problem] if index in clocks_apart else []
             values: dict[str, object] = {}
             for handle, topic in inputs:
                 troubles += self._input_troubles(handle, topic, robot, now_ns)
                 if topic.expected or self._ingest.statistics[handle].received:
-                    values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+                    values.update(self._values(handle, topic, now_ns, elapsed_s))
             words = "seeing" if robot is None else _state(index, estimate, troubles, values)
             values |= drop_values(drops_of[index]) if drops_of else {}
             values |= {"measurements used": str(used[index]), "NIS mean": _figure(mean_nis[index])}
@@ -200,7 +204,7 @@ class Diagnostics:
         for handle, topic in self._of_swarm:
             troubles += self._input_troubles(handle, topic, None, now_ns)
             if self._ingest.statistics[handle].received:
-                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+                values.update(self._values(handle, topic, now_ns, elapsed_s))
         summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
         words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
         turned = int(np.sum((estimate.status != Status.WAITING) & ~estimate.heading_known))
@@ -214,15 +218,7 @@ class Diagnostics:
         some = {topic: names for topic, names in found.items() if names}
         return [f"{topic} has {len(names)} publishers: {listed(names)}" for topic, names in some.items()]
 
-    def _drop_troubles(self, robot: int, drops: Mapping[str, int]) -> list[str]:
-        """One sentence for each reason for which messages of a robot were dropped in the interval."""
-        before, self._dropped[robot] = self._dropped[robot], dict(drops)
-        grown = {reason: drops.get(reason, 0) - before.get(reason, 0) for reason in _CAUSES}
-        some = [(reason, count) for reason, count in grown.items() if count]
-        return [f"dropped {count} of its data: they {_CAUSES[reason]}" for reason, count in some]
-
     def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
-        """Problems of an input, in words."""
         statistics = self._ingest.statistics[handle]
         if not statistics.received:
             why = self._graph.why_missing(topic.name, topic.kind.message_type)
@@ -231,7 +227,13 @@ class Diagnostics:
             return [f"no message on {topic.name} is a {topic.kind.message_type}"]
         troubles, found = [], self._ingest.frame_id(handle)
         silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
-        if silent_s > _patience_s(topic, robot, statistics):
+        # detectors and infrared boards have periods of their own
+        patience_s = max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
+        if topic.kind.name == "odometry" and robot is not None:
+            patience_s = robot.odometry.timeout_s
+        elif (topic.kind.of_each and not topic.expected) or topic.kind.rows == MapSensor.name:
+            patience_s = math.inf
+        if silent_s > patience_s:
             troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
         map_frame = self._ingest.map_frame
         if topic.kind.in_map and found != map_frame:
@@ -243,9 +245,7 @@ class Diagnostics:
             troubles.append(f"{topic.name} is in frame '{found}' but {published}")
         return troubles
 
-    def _input_values(
-        self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float
-    ) -> dict[str, object]:
+    def _values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, object]:
         """Figures of an input over the interval; begins its next one."""
         statistics = self._ingest.statistics[handle]
         name = topic.name if topic.kind.of_pairs else topic.kind.topic
@@ -297,15 +297,6 @@ def merged(reports: Sequence[Report], name: str) -> Report:
     return Report(name, message, level_of(warnings), values)
 
 
-def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatistics) -> float:
-    """How long an input may be silent; detectors and infrared boards have periods of their own."""
-    if topic.kind.name == "odometry" and robot is not None:
-        return robot.odometry.timeout_s
-    if (topic.kind.of_each and not topic.expected) or topic.kind.rows == MapSensor.name:
-        return math.inf
-    return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
-
-
 def _state(index: int, estimate: Estimate, troubles: list[str], values: dict[str, object]) -> str:
     """The state of a robot in words, which is added to troubles and values."""
     status, sigma = Status(int(estimate.status[index])), np.sqrt(np.diagonal(estimate.covariances[index]))
@@ -323,16 +314,6 @@ def _state(index: int, estimate: Estimate, troubles: list[str], values: dict[str
     values["sigma theta [rad]"] = _figure(sigma[2])
     unknown = status is not Status.WAITING and not heading_known
     return f"{status.name.lower()}{', heading unknown' if unknown else ''}"
-
-
-def _unused_scans(robot: int, recent: Recent) -> list[str]:
-    """A sentence if none of the newest scans of a robot is used."""
-    measurements, verdicts, _ = recent
-    own = verdicts[(measurements.model == SCAN) & (measurements.target == robot)]
-    if not own.size or (own == Verdict.USED).any():
-        return []
-    most = Verdict(int(np.bincount(own).argmax()))
-    return [f"none of its last {own.size} scans is used: they {_UNUSED_SCANS[most]}"] if most else []
 
 
 def _figure(value: float | None) -> str:

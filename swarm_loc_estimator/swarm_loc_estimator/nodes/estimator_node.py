@@ -2,12 +2,7 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
-`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
-to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
-`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
-other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
-Services: `~/reset`, `~/set_robot_pose`, and those of a managed node. Parameters: see `doc/estimator_node.md`.
+Topics, services and parameters: see `doc/estimator_node.md`. No other node may publish its transforms.
 """
 
 from __future__ import annotations
@@ -32,6 +27,7 @@ from swarm_loc_estimator.nodes import estimator_diagnostics as diagnostics
 from swarm_loc_estimator.nodes import estimator_topics as topics
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.refinement import Refinement
 from swarm_loc_estimator.precompile import precompile, size_of
 from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -45,8 +41,7 @@ _ORDINARY_DROPS = SHED_REASONS | {
     *("aerial_ambiguous", "aerial_unassigned", "duplicate", "gated", "ir_saturated", "ir_too_weak"),
     *("ir_undetermined", "odometry_duplicate", "reset", "too_old", "not_localized"),
 }
-"""Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
-Drops under overload have a warning of their own."""
+"""Ordinary drops, which are not logged; those under overload have a warning of their own."""
 
 _READ_BYTES = 8_000_000  # Read and thinned out at once: what is read takes more memory than what is left
 INACTIVE = "Nothing was changed: the estimator is not active."  # Answer of the services while it is not
@@ -55,15 +50,13 @@ CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
 
 class EstimatorNode(ManagedNode[EstimatorParameters]):
-    """Takes messages, runs the estimator once per tick and publishes the estimate.
-
-    Tests pass another function that creates the estimator.
-    """
+    """Takes messages, runs the estimator, which tests replace, once per tick, and publishes the estimate."""
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._create_estimator = create_estimator
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/refine", self._on_refine)
         self.create_service(SetRobotPose, "~/set_robot_pose", self._on_set_robot_pose)
         self.autostart()
 
@@ -98,6 +91,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._outputs = topics.EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
+        self._refinement = Refinement()
+        self.at_end(self._refinement.stop)
         self._static_transforms = topics.StaticTransforms(self, self._swarm, self._ingest, self.params)
         horizon_s = self.params.settings.horizon_s
         self._inputs = topics.EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
@@ -137,6 +132,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps
+            self._refinement.forget()
             self.get_logger().warning("clock jumped back; estimator reset")
         self._follow_frame()
         self._outputs.publish(self._estimate)
@@ -149,8 +145,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
     def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[Estimate, float]:
         """Fuse within the time budget; returns the poses at an instant and the time that fusing took [s].
 
-        Fusing a large swarm takes longer than a tick and is spread over several ticks. In between, poses are
-        predicted by odometry.
+        Fusing a large swarm is spread over several ticks, in between which poses are predicted by odometry.
         """
         is_due = not self._estimator.is_fusing and self._pace.is_due(begin_s, now_ns)
         if is_due:
@@ -175,6 +170,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             self._measurements.update(thinned.measurements)
             self._cost.note_sightings(sum(thinned.measurements.values()), thinned.shed)
             self._estimator.receive(thinned.messages)
+            self._refinement.keep(thinned.messages)
         # how many measurements were in messages that were not read is not known: as many as usually
         for sensor, count in self._measurements.items():
             unread = self._inputs.unread.pop(sensor, 0)
@@ -196,7 +192,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
 
     @property
     def _frame(self) -> str:
-        """Frame of all poses."""
         return f"{self._origin}/start" if self._origin else self.params.map_frame
 
     def report(self) -> None:
@@ -221,8 +216,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         """One report per robot and one for the estimator; warnings are logged."""
         # Load, and what was left out or dropped.
         periods_s = self.params.tick_period_s, self._estimator.settings.fusion_period_s
-        load = diagnostics.load_report(cost, elapsed_s, *periods_s)
-        causes = [load, diagnostics.shedding_report(cost)]
+        causes = [diagnostics.load_report(cost, elapsed_s, *periods_s), diagnostics.shedding_report(cost)]
         for report in causes:
             if report.warning:
                 self.health.warn(report.name, report.message)
@@ -262,6 +256,15 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimator.reset()
         response.success, response.message = True, "All robots restart at their configured poses."
         self.get_logger().info("estimator reset by service")
+        return response
+
+    def _on_refine(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.is_active:
+            response.message = INACTIVE
+            return response
+        answer = self._refinement.ask(self._estimator.swarm, Path(self.params.swarm_file))
+        response.success, response.message = answer
+        self.get_logger().info(response.message)
         return response
 
     def _on_set_robot_pose(

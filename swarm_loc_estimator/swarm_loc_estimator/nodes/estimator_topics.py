@@ -1,7 +1,4 @@
-"""Topics of the estimator: raw inputs, which are queued until the next tick, and published estimates.
-
-Users set poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`.
-"""
+"""Topics of the estimator: inputs, queued until the next tick, estimates, and commands that set poses."""
 
 from __future__ import annotations
 
@@ -18,15 +15,10 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_estimator.common.messages import poses
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_identities
-from swarm_loc_estimator.common.messages.poses import (
-    PLANE,
-    SwarmPosesEncoder,
-    TransformsEncoder,
-    encode_poses,
-    planar_pose,
-)
+from swarm_loc_estimator.common.messages.poses import PLANE, planar_pose
 from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
@@ -57,10 +49,7 @@ class SetPoseError(ValueError):
 
 
 class PoseCommands:
-    """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
-
-    Poses must be in `map_frame`. Users ask by a service and, if `by_topics`, by a topic for each robot.
-    """
+    """Sets the pose of a robot in `map_frame`, or deinitializes it, by a service and, if wanted, topics."""
 
     def __init__(
         self, node: Node, swarm: Swarm, estimator: Estimator, map_frame: str, *, by_topics: bool
@@ -132,13 +121,12 @@ class PoseCommands:
 
 
 _RATE_HZ, _FAST_HZ, _IMAGE_HZ = 100, 500, 30
-"""Highest rate of a topic of which all messages within the horizon wait, that of odometry and turn rates,
-which are small unless they are of many robots, and that of images: their queues take most of the memory."""
+"""Highest rates of topics of which all messages within the horizon wait: of most; of odometry and turn rates,
+which are small unless of many robots; and of images: their queues take most of the memory."""
 _LEAST_DEPTH, _MOST_DEPTH, _MAPS = 50, 1000, 5  # and of maps, which are large
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
-"""Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
-would get ever older data, which cost more to fuse, and never catch up."""
+"""Those of the usual horizon; with less, a late estimator would get ever older data and never catch up."""
 
 _MAX_SEQUENCES = 100  # Of a topic with several publishers; of fewer, a rare one would seem to follow a loss
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -160,12 +148,11 @@ def queue_depth(kind: InputKind, horizon_s: float) -> int:
 class EstimatorInputs:
     """Takes all inputs as raw bytes: building message objects would cost more than estimating.
 
-    Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
-    queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
-    publishers' sequence numbers, and those are dropped unread that have waited here for longer than the
-    horizon, after which nothing is fused. A topic whose queue was full is heard best effort from then on: to
-    send again what came too late adds to the load, and Fast DDS 2.14 keeps each message for good that is sent
-    again and older than a full queue. The index of a topic is its handle.
+    Messages wait in the middleware, which keeps the newest of each topic, not in the executor, whose queue is
+    unbounded; no executor may handle the subscriptions. Lost messages are detected by sequence numbers of
+    publishers; those that have waited for longer than the horizon are dropped unread. A topic whose queue was
+    full is heard best effort from then on: to send again what came too late adds to the load, and Fast DDS
+    2.14 keeps each such message for good. The index of a topic is its handle.
     """
 
     def __init__(
@@ -220,7 +207,7 @@ class EstimatorInputs:
         return [SerializedMessage(k, data, min(max(at_ns, begin_ns), now_ns)) for at_ns, k, data in taken]
 
     def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> int:
-        """Number of messages missing in the sequences of a topic's publishers, which messages do not name.
+        """Number of messages missing in the sequences of publishers, which messages do not name.
 
         A number that continues no sequence is the first of a new publisher, or follows the nearest one.
         """
@@ -271,8 +258,7 @@ class EstimatorInputs:
 def newest_time_ns(node: Node) -> int:
     """Time of a node [ns]; in simulated time that of the newest /clock received, handled or not.
 
-    On a busy machine a node may take data newer than the /clock that its executor handled last, which would
-    appear to be stamped in the future. The executor handles a clock that jumped back.
+    Else data newer than the /clock that a busy executor handled last would appear to be of the future.
     """
     now_ns = int(node.get_clock().now().nanoseconds)
     source = node._time_source  # noqa: SLF001 - rclpy has no public access to it
@@ -367,9 +353,9 @@ class EstimateOutputs:
     def use_frame(self, frame: str) -> None:
         """Publish all poses in a frame from now on."""
         self._frame = frame
-        self._swarm_poses_encoder = SwarmPosesEncoder(self._names, frame)
+        self._swarm_poses_encoder = poses.SwarmPosesEncoder(self._names, frame)
         self._transforms = [
-            (publisher, TransformsEncoder(frame, [*children]), np.array([*children.values()]))
+            (publisher, poses.TransformsEncoder(frame, [*children]), np.array([*children.values()]))
             for publisher, children in zip(self._tf, self._children.values(), strict=True)
         ]
 
@@ -387,7 +373,7 @@ class EstimateOutputs:
         heard = [k for k, one in enumerate(self._robot_poses) if located[k] and one.get_subscription_count()]
         if heard:
             stamps_ns = np.full(len(heard), e.stamp_ns)
-            messages = encode_poses(self._frame, stamps_ns, e.poses[heard], e.covariances[heard])
+            messages = poses.encode_poses(self._frame, stamps_ns, e.poses[heard], e.covariances[heard])
             for robot, message in zip(heard, messages, strict=True):
                 self._robot_poses[robot].publish(message)
 

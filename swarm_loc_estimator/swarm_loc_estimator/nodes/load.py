@@ -2,14 +2,11 @@
 
 Under overload, measurements are dropped uniformly over all robots and pairs. Each source (a robot's camera,
 infrared board or fixes, an overhead camera) has the same maximum number of used measurements, so those that
-send most lose measurements first (max-min fairness; D. Bertsekas, R. Gallager: Data Networks, 6.5.2).
-Measurement k of a source is used if the fractional part of k times the golden ratio is below the share. This
-sequence is uniform over any interval and over every n-th number (H. Weyl: Ueber die Gleichverteilung von
-Zahlen mod. Eins, 1916), so a robot that sends its detections always in the same order does not lose the same
-neighbour each time.
-
-A large swarm fuses the measurements of a fusion period as one batch, whose cost hardly depends on their
-number. So whole periods are used or dropped: period k by the same rule.
+send most lose first (max-min fairness; D. Bertsekas, R. Gallager: Data Networks, 6.5.2). Measurement k of a
+source is used if the fractional part of k times the golden ratio is below the share: a sequence uniform over
+any interval and over every n-th number (H. Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so
+robots that send detections in one order do not lose the same neighbour each time. The cost of fusing a period
+of a large swarm hardly depends on their number: whole periods are used or dropped, by the same rule.
 """
 
 from __future__ import annotations
@@ -131,9 +128,8 @@ def _units(sensor: type[Sensor], rows: Any) -> _Units:
     return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)
 
 
-# Checked by test_shedding.py and test_fusion_pace.py, and on live swarms by make bench-large_swarms.
-MIN_SHARE = 0.01
-"""Least share, however busy the node is: without any measurements, robots would be lost for good."""
+# Checked by test_fusion_period.py, and on live swarms by make bench-large_swarms.
+MIN_SHARE = 0.01  # However busy the node is: without any measurements, robots would be lost for good
 _WINDOW_S = 0.5  # Least time over which the load is measured, since fusing comes in bursts
 _BUSY = 0.9  # Load above which a node may not keep up
 _MAX_WAIT = 0.5  # Share of the horizon; data that wait longer to be fused would soon be too old
@@ -141,17 +137,15 @@ _AT_EASE = 0.6  # Load below which the share grows. Between the two limits it st
 _SMOOTHING = 0.2  # Smoothing factor of the time that fusing takes, an average over about five windows
 _AIM = 0.75  # Load to which a cut leads
 _MIN_CUT, _MAX_CUT = 0.5, 0.125  # Limits of the factor by which the share is cut per window
-_GROWTH = 1.3
-"""Growth of the share per window at low load; it is too small to lead from one load limit past the other."""
+_GROWTH = 1.3  # Of the share per window at low load; too small to lead from one limit past the other
 _LONGEST_WAIT = 0.25  # Share of the horizon that data may wait to be fused
 
 
 class Shedding:
     """Cuts the share of measurements used while fusing cannot keep up, and lets it grow again.
 
-    A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
-    only the time of fusing: where fusing takes no more than its guaranteed share of a core, `fusion_load`,
-    the share is not cut further; where it takes less than half of that, the share grows.
+    A node that catches up again, as at its start, drops nothing. Where fusing takes no more than its share of
+    a core, `fusion_load`, the share is not cut further; where it takes less than half of it, the share grows.
     """
 
     def __init__(self, fusion_load: float, horizon_s: float) -> None:
@@ -167,22 +161,20 @@ class Shedding:
         """Begin a tick at a steady time [s]; data have waited for at most `waited_s` to be fused."""
         if self._ticked_s is None:
             self._ticked_s = self._begin_s = wall_s
-        if wall_s - self._begin_s >= _WINDOW_S:
-            self._adapt(wall_s - self._begin_s, waited_s)
+        elapsed_s = wall_s - self._begin_s
+        if elapsed_s >= _WINDOW_S:
+            load, fusing_load = self._busy_s / elapsed_s, self._fusing_s / elapsed_s
+            is_late = load >= _BUSY and waited_s >= self._max_wait_s
+            self._fusing_load += _SMOOTHING * (fusing_load - self._fusing_load)
+            if load < _AT_EASE or self._fusing_load < 0.5 * self._fusion_load:
+                self.share = min(1.0, _GROWTH * self.share)
+            elif is_late and self._may_cut and fusing_load > self._fusion_load:
+                self._may_cut = False
+                cut = _AIM * self._handled_s / self._busy_s  # longer ticks are an overload
+                self.share = max(MIN_SHARE, self.share * min(max(cut, _MAX_CUT), _MIN_CUT))
             self._begin_s, self._handled_s, self._busy_s, self._fusing_s = wall_s, 0.0, 0.0, 0.0
         self._handled_s += wall_s - self._ticked_s  # it handles what was received since the previous one
         self._ticked_s = wall_s
-
-    def _adapt(self, elapsed_s: float, waited_s: float) -> None:
-        load, fusing_load = self._busy_s / elapsed_s, self._fusing_s / elapsed_s
-        is_late = load >= _BUSY and waited_s >= self._max_wait_s
-        self._fusing_load += _SMOOTHING * (fusing_load - self._fusing_load)
-        if load < _AT_EASE or self._fusing_load < 0.5 * self._fusion_load:
-            self.share = min(1.0, _GROWTH * self.share)
-        elif is_late and self._may_cut and fusing_load > self._fusion_load:
-            self._may_cut = False
-            cut = _AIM * self._handled_s / self._busy_s  # longer ticks are an overload
-            self.share = max(MIN_SHARE, self.share * min(max(cut, _MAX_CUT), _MIN_CUT))
 
     def begin_fusion(self) -> None:
         """Begin fusing; from now on the effect of the previous cut is known."""

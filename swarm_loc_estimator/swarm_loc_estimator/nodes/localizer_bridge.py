@@ -48,15 +48,13 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
         }
         received = message_class(self._source.message_type)
         for topic, body in self._robots.topics.items():
-            take = partial(self._on_message, topic, body)
-            self.create_subscription(received, topic, take, _INPUT_QOS)
+            self.create_subscription(received, topic, partial(self._on_message, topic, body), _INPUT_QOS)
         self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._outputs)} robots of '{parameters.swarm_file}'")
 
     def _on_message(self, topic: str, body: str, message: Any) -> None:
         self.health.received(topic)
-        arrival_ns = self.get_clock().now().nanoseconds
-        for robot, data in self._robots.serialized(message, body, arrival_ns):
+        for robot, data in self._robots.serialized(message, body, self.get_clock().now().nanoseconds):
             self._outputs[robot].publish(data)
 
     def _on_diagnostics(self) -> None:

@@ -2,11 +2,8 @@
 
     ./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`, or `<robot>/scan`, and for mounts of
-lidars to `/tf_static` and `<robot>/tf_static`. It publishes `map`,
-`visitation`, `<robot>/goal`, `<robot>/fix` (the estimator, which owns the transforms, fuses it) and
-`/diagnostics`.
-Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
+Topics, services and parameters: see `doc/mapper_node.md`. The estimator, which owns the transforms, fuses
+the fixes.
 """
 
 from __future__ import annotations
@@ -133,7 +130,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             self._goals[robot].publish(encode_pose_stamped(frame, np.array([goal.stamp_ns]), pose)[0])
 
     def _publish_map(self) -> None:
-        """Publish the map and the visits if the map has changed."""
         occupancy = self._mapper.occupancy()
         if occupancy is self._published:
             return

@@ -32,7 +32,9 @@ def precompile() -> None:
         aside = np.array([0.0, 0.0, 0.5 * math.pi - wrap_angle(pose[2] + turn[2])])
         ahead = np.array([0.0, 0.4 if stop % 2 == 0 else -0.4, 0.0])
         for way, speed in ((turn, _TURN_RATE), (aside, _TURN_RATE), (ahead, _SPEED)):
-            poses = _along(pose, way, speed)
+            count = max(2, round(float(np.abs(way).max()) / (speed * _PERIOD_NS * 1e-9)))
+            poses = pose + way * (np.arange(1, count + 1)[:, None] / count)  # one for each reading
+            poses[:, 2] = wrap_angle(poses[:, 2])
             stamps = stamp_ns + _PERIOD_NS * np.arange(1, len(poses) + 1)
             mapper.add_readings(robot, Readings(stamps, poses, _inverse_distances(poses), _SIGMA))
             pose, stamp_ns = poses[-1], int(stamps[-1])
@@ -58,14 +60,6 @@ def precompile() -> None:
     mapper.occupancy()
     yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
     note_precompiled(precompile)
-
-
-def _along(pose: FloatArray, way: FloatArray, speed: float) -> FloatArray:
-    """Poses (n, 3) on the way from one that a speed [m/s] or [rad/s] allows, one for each reading."""
-    count = max(2, round(float(np.abs(way).max()) / (speed * _PERIOD_NS * 1e-9)))
-    poses = pose + way * (np.arange(1, count + 1)[:, None] / count)
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    return poses
 
 
 def _inverse_distances(poses: FloatArray) -> FloatArray:

@@ -17,20 +17,14 @@ class EstimatorParameters:
     autostart: bool = autostart()
     swarm_file: str = text("", "path of the swarm description", required=True)
     tick_period_s: float = number(0.05, "s", 0.005, 1.0, "period in which data is used and poses published")
-    fusion_load: float = number(
-        0.1, "1", 0.01, 1.0, "share of a core that fusing may take; a large swarm fuses at fewer ticks then"
-    )
+    fusion_load: float = number(0.1, "1", 0.01, 1.0, "share of a core for fusing: big swarms fuse less often")
     map_frame: str = text("map", "frame that all poses are in", required=True)
-    odom_frame: str = text(
-        "odom", "transforms go from map_frame to <robot>/odom_frame, the frame of its odometry", required=True
-    )
+    odom_frame: str = text("odom", "frame of odometry: transforms go to <robot>/odom_frame", required=True)
     publish_tf: bool = flag(True, "publish these transforms")
     tf_per_robot: bool = flag(False, "publish them on <robot>/tf, to odom_frame without <robot>/, for Nav2")
     transform_tolerance_s: float = number(0.0, "s", 0.0, 10.0, "post-dating of transforms, as by AMCL")
     publish_robot_poses: bool = flag(True, "publish <robot>/pose, too, unless shared_topics")
-    shared_topics: bool = flag(
-        False, "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot"
-    )
+    shared_topics: bool = flag(False, "listen to swarm/odom, swarm/detections and swarm/fixes, not per robot")
     settings: Settings = field(default_factory=Settings, metadata={"numbers_of": Settings})
 
     def odom_frame_of(self, robot: str) -> str:
@@ -53,11 +47,7 @@ class MapperParameters:
 
 
 def chosen_robots(wanted: Collection[str], known: Collection[str]) -> list[str]:
-    """Names of the robots that map, in the order of the description; all of `known` if none is wanted.
-
-    Raises:
-        ParameterError: A wanted robot is not in the description.
-    """
+    """The wanted ones of known robots, in their order; all if none is wanted. Raises ParameterError."""
     for name in wanted:
         if name not in known:
             raise ParameterError(f"parameter robots: there is no robot '{name}' in the swarm description.")
@@ -73,9 +63,7 @@ class PlayerParameters:
     loop: bool = flag(False, "play again from the beginning at the end, without limit")
     start_offset_s: float = number(0.0, "s", 0.0, 1e9, "offset in the bag at which playing begins")
     topics: tuple[str, ...] = texts("topics to play; all when empty")
-    wait_for_subscribers: int = number(
-        0, "1", 0, 100000, "number of topics, besides /clock, that need a subscriber first; 0: do not wait"
-    )
+    wait_for_subscribers: int = number(0, "1", 0, 100000, "topics but /clock that need a subscriber first")
     clock: bool = flag(True, "publish /clock")
 
 

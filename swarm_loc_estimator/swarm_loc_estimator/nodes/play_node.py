@@ -23,7 +23,7 @@ from rclpy.time import Time
 from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.common.bags.reader import BagReader, RawMessage
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.node import ConfiguredNode, MessageTypeError, Stop, message_class, run_node
 from swarm_loc_estimator.common.parameters import ParameterError
@@ -35,11 +35,9 @@ _POLL_S = 0.05
 _SETTLED_S = 0.5  # Discovery of subscriptions counts as complete after this time without a new one
 _SAY_EVERY_S = 5.0
 _LAST_WORDS_S = 30.0
-"""Time to wait for acknowledgements. DDS removes a dead subscriber after 20 s; a live one acknowledges
-earlier, even by a lossy radio, where lost packets are requested again only every 3 s."""
+"""For acknowledgements: DDS removes a dead subscriber after 20 s; a lossy radio asks again every 3 s."""
 _AT_ONCE = Duration(nanoseconds=0)
-_RUN_ON_S = 0.25
-"""Time for which /clock continues after the last message, so that timers of other nodes process it."""
+_RUN_ON_S = 0.25  # /clock goes on after the last message, so that timers of other nodes process it
 DEPTH = 1000  # History depth of the player's publishers, whatever the recorded depth; enough for any rate
 RELIABLE = QoSProfile(depth=DEPTH)  # Reliable, which matches reliable and best-effort subscribers
 LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -63,7 +61,14 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         # first of all: others learn of publishers in this order, and of thousands the last one after long
         clock = partial(self.create_publisher, ClockMessage, "/clock", RELIABLE)
         self._clock_publisher = clock() if self.params.clock else None
-        for topic in self._chosen_topics():
+        # the topics to play, without the /clock of the bag
+        topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
+        wanted = [name.lstrip("/") for name in self.params.topics]
+        for name in wanted:
+            if name not in topics:
+                there = f"'{self.params.bag}' has: {listed([*topics])}"
+                raise ParameterError(f"parameter topics names '{name}', but {there}.")
+        for topic in (topics[name] for name in wanted or topics):
             try:
                 publishes = message_class(topic.type)
             except MessageTypeError:
@@ -87,8 +92,11 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
             if not self.params.loop or self.so_far.messages == played_before:
                 break
         self._wait_for_acknowledgements(stop)
-        if not stop.requested:
-            self._run_clock_on()
+        # /clock goes on after the last message, in real time whatever the rate
+        begin_s, begin_ns = time.monotonic(), self._now_ns
+        for step in range(1, 0 if stop.requested else round(_RUN_ON_S / STEP_S) + 1):
+            self.wait_until(begin_s + step * STEP_S)
+            self.publish_clock(begin_ns + step * round(STEP_S * 1e9))
         for loss in self._reader.losses:
             print(f"play: {loss}", file=sys.stderr)
         print(self.so_far.summary(), flush=True)
@@ -100,16 +108,6 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         self._own_executor.shutdown()
         super().destroy_node()
 
-    def _chosen_topics(self) -> list[BagTopic]:
-        """The topics to play, without the /clock of the bag."""
-        topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
-        wanted = [name.lstrip("/") for name in self.params.topics]
-        for name in wanted:
-            if name not in topics:
-                there = f"'{self.params.bag}' has: {listed([*topics])}"
-                raise ParameterError(f"parameter topics names '{name}', but {there}.")
-        return [topics[name] for name in wanted or topics]
-
     def publish(self, message: RawMessage) -> None:
         """Publish a message of the bag."""
         topic, _, _, data = message
@@ -120,13 +118,6 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         self._now_ns = now_ns
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
-
-    def _run_clock_on(self) -> None:
-        """Continue /clock after the last message, in real time whatever the rate."""
-        begin_s, begin_ns = time.monotonic(), self._now_ns
-        for step in range(1, round(_RUN_ON_S / STEP_S) + 1):
-            self.wait_until(begin_s + step * STEP_S)
-            self.publish_clock(begin_ns + step * round(STEP_S * 1e9))
 
     def now_s(self) -> float:
         """The steady clock."""
@@ -172,10 +163,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
 
 def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
-    """The profile to publish a topic with, by the recorded profiles of its publishers.
-
-    If these differ or none is known, it is reliable, and latched for topics that are latched by convention.
-    """
+    """The profile of a topic by those recorded; if they differ: reliable, and latched where that is usual."""
     profiles = [_profile(one) for one in recorded]
     if profiles and all(one == profiles[0] for one in profiles):
         return profiles[0]

@@ -32,10 +32,8 @@ class PlayedSoFar:
         """One line for people."""
         bag_s = self.bag_ns / _SECOND
         rate = f" ({bag_s / self.wall_s:.3g} x)" if self.wall_s > 0.0 else ""
-        return (
-            f"played {self.messages} messages of {bag_s:.1f} s in {self.wall_s:.1f} s{rate},"
-            f" at most {1e3 * self.latest_s:.1f} ms late"
-        )
+        played = f"played {self.messages} messages of {bag_s:.1f} s in {self.wall_s:.1f} s{rate}"
+        return f"{played}, at most {1e3 * self.latest_s:.1f} ms late"
 
 
 class Output(Protocol):

@@ -66,12 +66,15 @@ def fault_of_step(
     agreed, fastest = tracks.agreed[robot, row], tracks.fastest[robot, row]
     for i in range(2):
         agreed[i], fastest[i] = tracks.agreed[robot, row - 1, i], tracks.fastest[robot, row - 1, i]
-    # A step beyond the limits of the robot is a jump; one to the origin is a restart.
-    fault = NO_FAULT
-    if _is_beyond_limits(tracks, robot, step, duration_s):
+    # A step beyond the limits of the robot is a jump; one to the origin after a pause is a restart.
+    fault, stamps = NO_FAULT, tracks.stamp_ns[robot]
+    # tolerance of half a robot's width, because stamps jitter
+    near = math.hypot(step[0], step[1]) <= model.max_speed * duration_s + 0.5 * model.wheel_separation
+    if not (near and abs(step[2]) <= model.max_turn_rate * duration_s + _TURN_SLACK):  # True for NaN
         fault = JUMP
-    elif _is_restart(tracks, robot, row, duration_s):
-        fault = RESET
+    elif row > 1 and _is_zero(tracks, robot, row) and not _is_zero(tracks, robot, row - 1):
+        is_paused = duration_s > _RESTART_GAP * 1e-9 * (stamps[row - 1] - stamps[row - 2])
+        fault = RESET if is_paused else NO_FAULT
     # The twist, where it is known, says how far the step may be.
     earlier, later = tracks.twist[robot, row - 1], tracks.twist[robot, row]
     known = math.isfinite(earlier[0] + earlier[1] + earlier[2] + later[0] + later[1] + later[2])
@@ -97,26 +100,6 @@ def fault_of_step(
         elif moves[i]:
             agreed[i] = min(_AGREED_MOST, agreed[i] + 1)
     return fault
-
-
-@inlined_njit
-def _is_beyond_limits(
-    tracks: TrackArrays, robot: int, step: tuple[float, float, float], duration_s: float
-) -> bool:
-    """Whether a step exceeds the maximum speed or turn rate."""
-    model = tracks.model[robot]
-    # tolerance of half a robot's width, because stamps jitter
-    near = math.hypot(step[0], step[1]) <= model.max_speed * duration_s + 0.5 * model.wheel_separation
-    return not (near and abs(step[2]) <= model.max_turn_rate * duration_s + _TURN_SLACK)  # True for NaN
-
-
-@inlined_njit
-def _is_restart(tracks: TrackArrays, robot: int, row: int, duration_s: float) -> bool:
-    """Whether the pose is zero after a pause, and was not before."""
-    if row < 2 or not _is_zero(tracks, robot, row) or _is_zero(tracks, robot, row - 1):
-        return False
-    stamps = tracks.stamp_ns[robot]
-    return bool(duration_s > _RESTART_GAP * 1e-9 * (stamps[row - 1] - stamps[row - 2]))
 
 
 @inlined_njit
@@ -181,15 +164,10 @@ def insert_rates(
 ) -> int:
     """Insert turn rates (k,) in any order, for which there is space, and integrate them.
 
-    Args:
-        tracks: The tracks; their rows are not integrated again, see `integrate_again`.
-        robots: (k,) robot of each.
-        stamps_ns: (k,) instants, calibrated for delay.
-        rates: (k,) finite turn rates about the vertical as measured [rad/s].
-        from_ns: (N,) written: instant after which turns of odometry steps have changed; LATEST_NS: never.
-
-    Returns:
-        Number of rates at the instant of another one, which are dropped.
+    Stamps are calibrated for delay, rates finite and about the vertical as measured [rad/s]. Rows are not
+    integrated again, see `integrate_again`; `from_ns` (N,) is written: the instant after which turns of
+    odometry steps have changed; LATEST_NS: never. Returns the number of dropped ones, at the instant of
+    another.
     """
     duplicates, first = 0, np.full(from_ns.size, LATEST_NS)
     for k in range(robots.size):
@@ -211,7 +189,9 @@ def insert_rates(
             _integrate(tracks, robot, first[robot])
             changed_ns = tracks.gyro_ns[robot, max(0, first[robot] - 1)]
             newest_ns = tracks.gyro_ns[robot, tracks.gyro_filled[robot] - 1]
-            if _has_rows(tracks, robot, changed_ns, newest_ns):
+            stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
+            row = np.searchsorted(stamps, changed_ns, side="right")
+            if row < stamps.size and stamps[row] <= newest_ns:  # there is odometry in between
                 from_ns[robot] = changed_ns
     return duplicates
 
@@ -231,14 +211,6 @@ def _integrate(tracks: TrackArrays, robot: int, first: int) -> None:
                 pieces[k] += 1
             else:
                 angles[k] += 0.5 * (rates[k - 1] + rates[k]) * step_ns * 1e-9
-
-
-@inlined_njit
-def _has_rows(tracks: TrackArrays, robot: int, after_ns: int, until_ns: int) -> bool:
-    """Whether a robot has odometry after an instant and not after another one."""
-    stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
-    row = np.searchsorted(stamps, after_ns, side="right")
-    return bool(row < stamps.size and stamps[row] <= until_ns)
 
 
 @inlined_njit
@@ -344,11 +316,8 @@ def continue_tracks(
         robot = robots[k]
         delayed[k] = stamps_ns[k] + tracks.delay_ns[robot]
         filled[robot] += 1
-        if (
-            stamps_ns[k] < oldest_ns
-            or delayed[k] <= newest[robot]
-            or filled[robot] > tracks.stamp_ns.shape[1]
-        ):
+        is_late = stamps_ns[k] < oldest_ns or delayed[k] <= newest[robot]
+        if is_late or filled[robot] > tracks.stamp_ns.shape[1]:
             return Integrated(-1, -1, -1)
         if changed_from_ns[robot] == UNCHANGED_NS:
             changed_from_ns[robot] = newest[robot]
@@ -532,15 +501,7 @@ def _add_unknown(
     rate: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Add the noise of one step of unknown motion.
-
-    Args:
-        model: Odometry model of the robot.
-        unknown_s: Duration of the unknown motion at the previous row and at this row [s].
-        pose: (3,) pose at the start of the unknown motion.
-        rate: (3,) rate at the start of the unknown motion.
-        covariance: (3, 3) sum to add to.
-    """
+    """Add the noise of a step of motion that is unknown, until the previous row and this one [s]."""
     add_dropout_noise(model, unknown_s[1], True, pose, rate, covariance)
     if unknown_s[0] > 0.0:  # already added at the previous row
         known = np.zeros((3, 3))
@@ -559,9 +520,12 @@ def _true_motion(
 ) -> tuple[float, float, float]:
     """Calibrated displacement forward and left and turn of a reported step; writes the final rate (3,)."""
     model = tracks.model[robot]
+    # True shares of speed and turn rate, bilinear in the grid of the robot's response.
     speed = math.hypot(reported[0], reported[1]) / duration_s
-    speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
-    scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
+    i, a = _bracket(tracks.response_speed[robot], speed)
+    j, b = _bracket(tracks.response_turn_rate[robot], abs(reported[2]) / duration_s)
+    scale = model.distance_scale * _bilinear(tracks.response[robot, 0], i, j, a, b)
+    turn_scale = model.turn_scale * _bilinear(tracks.response[robot, 1], i, j, a, b)
     ahead, aside, turning = reported
     is_moving = ahead != 0.0 or aside != 0.0 or turning != 0.0
     turn_rate = turn_scale * turning / duration_s + (model.turn_bias if is_moving else 0.0)
@@ -570,27 +534,12 @@ def _true_motion(
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)
         mean = (1.0 - remaining) * model.lag_s / duration_s
-    forward, left, turn = (
-        before_rate[0] - true_rate[0],
-        before_rate[1] - true_rate[1],
-        before_rate[2] - true_rate[2],
-    )
+    forward, left = before_rate[0] - true_rate[0], before_rate[1] - true_rate[1]
+    turn = before_rate[2] - true_rate[2]
     rate[0], rate[1] = true_rate[0] + remaining * forward, true_rate[1] + remaining * left
     rate[2] = true_rate[2] + remaining * turn
-    return (
-        (true_rate[0] + mean * forward) * duration_s,
-        (true_rate[1] + mean * left) * duration_s,
-        (true_rate[2] + mean * turn) * duration_s,
-    )
-
-
-@inlined_njit
-def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
-    """True shares of speed and turn rate, bilinear in the grid of the robot's response."""
-    i, a = _bracket(tracks.response_speed[robot], speed)
-    j, b = _bracket(tracks.response_turn_rate[robot], turn_rate)
-    table = tracks.response[robot]
-    return _bilinear(table[0], i, j, a, b), _bilinear(table[1], i, j, a, b)
+    forward, left = true_rate[0] + mean * forward, true_rate[1] + mean * left
+    return forward * duration_s, left * duration_s, (true_rate[2] + mean * turn) * duration_s
 
 
 @inlined_njit

@@ -244,13 +244,8 @@ class OdometrySample(NamedTuple):
 @cached_njit
 def new_sample(count: int) -> OdometrySample:
     """Allocate a sample of `count` look-ups."""
-    return OdometrySample(
-        np.zeros((count, 3)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros(count),
-    )
+    (pose, raw), (covariance, jacobian) = np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
+    return OdometrySample(pose, raw, covariance, jacobian, np.zeros(count))
 
 
 @inlined_njit
@@ -280,7 +275,13 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
         assign_matrix(out.covariance[k], tracks.covariance[robot, row])
         assign_matrix(out.jacobian[k], tracks.jacobian[robot, row])
     else:
-        _along_step(tracks, robot, (row, end), fraction, out, k)
+        _interpolate(tracks.pose[robot, row], tracks.pose[robot, end], fraction, out.pose[k])
+        _interpolate(tracks.raw[robot, row], tracks.raw[robot, end], fraction, out.raw[k])
+        for i in range(3):
+            for j in range(3):
+                for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
+                    before, after = table[robot, row, i, j], table[robot, end, i, j]
+                    target[k, i, j] = before + fraction * (after - before)
         if fraction < 1.0:
             return
         row = end
@@ -317,23 +318,16 @@ def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, int
         return row, row + 1, max(0, stamp_ns - stamps[row]) / (stamps[row + 1] - stamps[row])
     silence_ns = max(0, stamp_ns - stamps[row])
     if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
-        begin = _rate_row(stamps, row)
+        # the rate at a row is that since the one before, or of several steps where this one is short, see
+        # `look_up`
+        begin = row - 1
+        if row > _RATE_STEPS:
+            one, two = stamps[row - 1] - stamps[row - 2], stamps[row - 2] - stamps[row - 3]
+            usual = max(min(one, two), min(max(one, two), stamps[row - 3] - stamps[row - 4]))
+            if stamps[row] - stamps[row - 1] < _LEAST_STEP * usual:
+                begin = row - _RATE_STEPS
         return begin, row, 1.0 + silence_ns / (stamps[row] - stamps[begin])
     return row, row, -1.0
-
-
-@inlined_njit
-def _rate_row(stamps: IntArray, row: int) -> int:
-    """Row from which on the rate at a row is measured: the one before, or several, see `look_up`."""
-    if row <= _RATE_STEPS:
-        return row - 1
-    one, two, three = (
-        stamps[row - 1] - stamps[row - 2],
-        stamps[row - 2] - stamps[row - 3],
-        stamps[row - 3] - stamps[row - 4],
-    )
-    usual = max(min(one, two), min(max(one, two), three))
-    return row - 1 if stamps[row] - stamps[row - 1] >= _LEAST_STEP * usual else row - _RATE_STEPS
 
 
 @inlined_njit
@@ -356,21 +350,6 @@ def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, floa
     cos, sin = math.cos(before[2] + 0.5 * turn), math.sin(before[2] + 0.5 * turn)
     dx, dy = after[0] - before[0], after[1] - before[1]
     return (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s, turn / duration_s
-
-
-@inlined_njit
-def _along_step(
-    tracks: TrackArrays, robot: int, rows: tuple[int, int], fraction: float, out: OdometrySample, k: int
-) -> None:
-    """Write row k of `look_up` at a fraction of the motion from a row to a later one; may exceed 1."""
-    row, end = rows
-    _interpolate(tracks.pose[robot, row], tracks.pose[robot, end], fraction, out.pose[k])
-    _interpolate(tracks.raw[robot, row], tracks.raw[robot, end], fraction, out.raw[k])
-    for i in range(3):
-        for j in range(3):
-            for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
-                before, after = table[robot, row, i, j], table[robot, end, i, j]
-                target[k, i, j] = before + fraction * (after - before)
 
 
 @cached_njit
@@ -420,16 +399,10 @@ def check_turn(
     is_moving: bool,
     repeats: bool,
 ) -> float:
-    """Compare the turns of a step by wheels and gyroscope; update the check of its row.
+    """Compare the turns of a row's step by wheels and gyroscope; update its check, a copy of that before.
 
-    Args:
-        tracks: The tracks.
-        robot: Index of the robot.
-        row: Row at the end of the step; its check is that of the row before.
-        turns: By the wheels and by the gyroscope [rad], and described variance of the first one [rad^2].
-        duration_s: Duration of the step [s].
-        is_moving: Whether the wheels moved.
-        repeats: Whether the gyroscope measured one value throughout.
+    `turns` are those by the wheels, which move or not, and by the gyroscope, which repeats one value or not
+    [rad], and the described variance of the first one [rad^2].
 
     Returns:
         Variance of the heading [rad^2] that was not added for earlier rows, while both contradict each other.

@@ -19,29 +19,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.odometry.preintegration import (
-    UNCHANGED_NS,
-    NewRows,
-    continue_tracks,
-    insert_rates,
-    integrate,
-    integrate_again,
-)
-from swarm_loc_estimator.odometry.track_arrays import (
-    BEFORE_ALL_NS,
-    CHECKS,
-    COVER_NS,
-    DOUBT,
-    GYRO,
-    IMU_DTYPE,
-    LATEST_NS,
-    MODEL_DTYPE,
-    WHEELS,
-    OdometrySample,
-    TrackArrays,
-    look_up_all,
-    unmark_from,
-)
+from swarm_loc_estimator.odometry import preintegration, track_arrays
 from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -50,19 +28,8 @@ _FIRST_CAPACITY = 256
 _TRIM_EVERY_NS = 1_000_000_000
 _JUMPING_NS = 3_000_000_000
 _ROWS = (
-    "stamp_ns",
-    "raw",
-    "pose",
-    "covariance",
-    "jacobian",
-    "rate",
-    "twist",
-    "agreed",
-    "fastest",
-    "unmoved",
-    "known_ns",
-    "jump_ns",
-    "gyro_check",
+    *("stamp_ns", "raw", "pose", "covariance", "jacobian", "rate", "twist", "agreed", "fastest", "unmoved"),
+    *("known_ns", "jump_ns", "gyro_check"),
 )
 _GYRO_ROWS = ("gyro_ns", "gyro_rate", "gyro_angle", "gyro_piece")
 
@@ -87,11 +54,12 @@ class OdometryTracks:
         models = [robot.odometry for robot in robots]
         self._robots = len(models)
         self._response = _stacked([robot.response or _IDEAL for robot in robots])
-        names = MODEL_DTYPE.names or ()
-        self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
-        self._imu = np.array(
-            [tuple(getattr(robot.imu, name) for name in IMU_DTYPE.names or ()) for robot in robots],
-            dtype=IMU_DTYPE,
+        self._model, self._imu = (
+            np.array([tuple(getattr(m, name) for name in dtype.names or ()) for m in some], dtype=dtype)
+            for dtype, some in (
+                (track_arrays.MODEL_DTYPE, models),
+                (track_arrays.IMU_DTYPE, [robot.imu for robot in robots]),
+            )
         )
         self._is_stationary = np.array([robot.stands for robot in robots], dtype=bool)
         walks = [robot.random_walk for robot in robots]
@@ -102,8 +70,8 @@ class OdometryTracks:
 
     def clear(self) -> None:
         """Remove all rows."""
-        self._oldest_ns = BEFORE_ALL_NS
-        self._trimmed_ns = BEFORE_ALL_NS
+        self._oldest_ns = track_arrays.BEFORE_ALL_NS
+        self._trimmed_ns = track_arrays.BEFORE_ALL_NS
         has_imu = bool(np.any(self._imu["turn_noise_density"] > 0.0))
         self.arrays = self._allocated(_FIRST_CAPACITY, _FIRST_CAPACITY if has_imu else 0)
 
@@ -117,7 +85,7 @@ class OdometryTracks:
     @property
     def unsettled_ns(self) -> int:
         """Time before the newest row for which it may make turns uncertain [ns]; 0 without gyroscopes."""
-        return COVER_NS if self.arrays.gyro_check.size else 0
+        return track_arrays.COVER_NS if self.arrays.gyro_check.size else 0
 
     def has_started(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
         """Whether robots (k,) have odometry before instants (k,); always True for robots without odometry."""
@@ -146,11 +114,13 @@ class OdometryTracks:
         if not self.arrays.gyro_check.size:
             return np.zeros(self._robots, dtype=bool)
         newest = np.maximum(self.arrays.filled - 1, 0)
-        return np.asarray(self.arrays.gyro_check[np.arange(self._robots), newest, DOUBT] > 0.0)
+        return np.asarray(self.arrays.gyro_check[np.arange(self._robots), newest, track_arrays.DOUBT] > 0.0)
 
     def turn_ratio(self, robot: int) -> float:
         """Turn of a robot's gyroscope per turn of its wheels, of all rows; NaN without turns."""
-        by_wheels, by_gyro = self.arrays.gyro_check[robot, : self.arrays.filled[robot], [WHEELS, GYRO]]
+        by_wheels, by_gyro = self.arrays.gyro_check[
+            robot, : self.arrays.filled[robot], [track_arrays.WHEELS, track_arrays.GYRO]
+        ]
         return float(by_gyro @ by_wheels / (by_wheels @ by_wheels or math.nan))
 
     def had_faults(self, now_ns: int, count: int) -> BoolArray:
@@ -163,31 +133,32 @@ class OdometryTracks:
     def extend(
         self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, twist: FloatArray | None = None
     ) -> TrackChange:
-        """Add rows in any order and of any age.
+        """Add rows (k,) of robots in any order and of any age, by their acquisition stamps.
 
-        Args:
-            robots: (k,) robot index of each row.
-            stamps_ns: (k,) acquisition stamps.
-            raw: (k, 3) finite poses as the driver reports them, in its own odom frame.
-            twist: (k, 3) velocity forward and left [m/s] and turn rate [rad/s]; NaN or None: not known.
+        `raw` (k, 3) are finite poses as the driver reports them, in its own odom frame, `twist` (k, 3)
+        velocities forward and left [m/s] and turn rates [rad/s]; NaN or None: not known.
         """
         twist = np.full(raw.shape, np.nan) if twist is None else twist
         changed_from = np.empty(self._robots, dtype=np.int64)
-        found = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, twist, changed_from)
+        found = preintegration.continue_tracks(
+            self.arrays, self._oldest_ns, robots, stamps_ns, raw, twist, changed_from
+        )
         if found.jumps >= 0:
             return TrackChange(changed_from, 0, robots[:0], found.jumps, found.resets)
         young = stamps_ns >= self._oldest_ns
         too_old = robots[~young]
-        rows = NewRows(robots, stamps_ns + self._delay_ns[robots], raw, twist, young)
-        rows, changed_from = self._take_back_later_rows(NewRows._make(column[young] for column in rows))
+        rows = preintegration.NewRows(robots, stamps_ns + self._delay_ns[robots], raw, twist, young)
+        rows, changed_from = self._take_back_later_rows(
+            preintegration.NewRows._make(column[young] for column in rows)
+        )
         robots, stamps, raw = rows[:3]
         order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
-        rows = NewRows._make(column[order] for column in rows)
+        rows = preintegration.NewRows._make(column[order] for column in rows)
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow(_ROWS)
-        found = integrate(self.arrays, self._oldest_ns, rows, changed_from)
+        found = preintegration.integrate(self.arrays, self._oldest_ns, rows, changed_from)
         return TrackChange(changed_from, found.duplicates, too_old, found.jumps, found.resets)
 
     def extend_turns(self, robots: IntArray, stamps_ns: IntArray, rates: FloatArray) -> TrackChange:
@@ -203,14 +174,14 @@ class OdometryTracks:
         while needed > self.arrays.gyro_ns.shape[1]:
             self._grow(_GYRO_ROWS)
         from_ns, changed_from = np.empty((2, self._robots), dtype=np.int64)
-        duplicates = insert_rates(self.arrays, robots, stamps_ns, rates, from_ns)
-        changed_from.fill(UNCHANGED_NS)
-        integrate_again(self.arrays, from_ns, changed_from)
+        duplicates = preintegration.insert_rates(self.arrays, robots, stamps_ns, rates, from_ns)
+        changed_from.fill(preintegration.UNCHANGED_NS)
+        preintegration.integrate_again(self.arrays, from_ns, changed_from)
         return TrackChange(changed_from, duplicates, too_old, 0, 0)
 
-    def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
+    def at(self, robots: IntArray, stamps_ns: IntArray) -> track_arrays.OdometrySample:
         """Look up the tracks of robots (m,) at instants (m,), see `look_up`."""
-        return look_up_all(self.arrays, robots, stamps_ns)
+        return track_arrays.look_up_all(self.arrays, robots, stamps_ns)
 
     def trim(self, oldest_ns: int, kept_ns: int) -> None:
         """Reject new rows before `oldest_ns`; remove rows not needed for look-ups from `kept_ns` on."""
@@ -232,9 +203,9 @@ class OdometryTracks:
                         rows[robot, : count - first] = rows[robot, first:count].copy()
                     filled[robot] = count - first
 
-    def _allocated(self, capacity: int, rates: int) -> TrackArrays:
+    def _allocated(self, capacity: int, rates: int) -> track_arrays.TrackArrays:
         shape, gyro_shape = (self._robots, capacity), (self._robots, rates)
-        arrays = TrackArrays(
+        arrays = track_arrays.TrackArrays(
             # rows of odometry
             filled=np.zeros(self._robots, dtype=np.int64),
             stamp_ns=np.zeros(shape, dtype=np.int64),
@@ -249,9 +220,9 @@ class OdometryTracks:
             unmoved=np.zeros((*shape, 3)),
             known_ns=np.zeros(shape, dtype=np.int64),
             jump_ns=np.zeros((*shape, 2), dtype=np.int64),
-            gyro_check=np.zeros((*shape, CHECKS if rates else 0)),
-            twist_from_ns=np.full(self._robots, LATEST_NS),
-            twist_until_ns=np.full(self._robots, LATEST_NS),
+            gyro_check=np.zeros((*shape, track_arrays.CHECKS if rates else 0)),
+            twist_from_ns=np.full(self._robots, track_arrays.LATEST_NS),
+            twist_until_ns=np.full(self._robots, track_arrays.LATEST_NS),
             # description of the robots
             delay_ns=self._delay_ns,
             model=self._model,
@@ -280,12 +251,8 @@ class OdometryTracks:
         new = {name: np.concatenate([rows, np.zeros_like(rows)], axis=1) for name, rows in old.items()}
         self.arrays = self.arrays._replace(**new)
 
-    def _take_back_later_rows(self, rows: NewRows) -> tuple[NewRows, IntArray]:
-        """Merge new rows with later rows of the tracks, which are removed to be integrated again.
-
-        Returns:
-            The rows, and the instant (N,) after which each track changes.
-        """
+    def _take_back_later_rows(self, rows: preintegration.NewRows) -> tuple[preintegration.NewRows, IntArray]:
+        """Merge new rows with later ones, which are taken back, and from when (N,) the tracks change."""
         arrays, (robots, stamps) = self.arrays, rows[:2]
         taken = [rows]
         newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
@@ -293,20 +260,17 @@ class OdometryTracks:
         late = (arrays.filled[robots] > 0) & (stamps <= newest)
         for robot in np.unique(robots[late]):
             count = arrays.filled[robot]
-            first = int(
-                np.searchsorted(arrays.stamp_ns[robot, :count], stamps[late & (robots == robot)].min())
-            )
-            first = unmark_from(arrays, robot, first)
+            first = int(arrays.stamp_ns[robot, :count].searchsorted(stamps[late & (robots == robot)].min()))
+            first = track_arrays.unmark_from(arrays, robot, first)
             later = (getattr(arrays, name)[robot, first:count] for name in ("stamp_ns", "raw", "twist"))
             again = np.zeros(count - first, dtype=bool)
-            taken.append(NewRows._make([np.full(count - first, robot), *later, again]))
+            taken.append(preintegration.NewRows._make([np.full(count - first, robot), *later, again]))
             arrays.filled[robot] = first
-        changed_from = np.full(self._robots, UNCHANGED_NS)
+        changed_from = np.full(self._robots, preintegration.UNCHANGED_NS)
         last = np.maximum(arrays.filled[robots] - 1, 0)
-        changed_from[robots] = np.where(
-            arrays.filled[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
-        )
-        return NewRows(*map(np.concatenate, zip(*taken, strict=True))), changed_from
+        newest = arrays.stamp_ns[robots, last]
+        changed_from[robots] = np.where(arrays.filled[robots] > 0, newest, track_arrays.BEFORE_ALL_NS)
+        return preintegration.NewRows(*map(np.concatenate, zip(*taken, strict=True))), changed_from
 
 
 def _stacked(responses: Sequence[MotionResponse]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -61,7 +61,6 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
 
 
 def _write(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
-    """Write the finite ones of poses (T, 3)."""
     with replacing(path) as part, part.open("w", encoding="utf-8") as file:
         for at_ns, (x, y, theta) in zip(stamp_ns.tolist(), pose.tolist(), strict=True):
             if math.isfinite(x + y + theta):
@@ -161,7 +160,6 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
 
 
 def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:
-    """Write trajectories as PoseStamped on `<robot>/<topic>`."""
     for name, track in tracks.items():
         writer.add_topic(f"{name}/{topic}", POSE_STAMPED)
         messages = encode_pose_stamped(_MAP, track.stamp_ns, track.pose)
@@ -170,7 +168,6 @@ def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter)
 
 
 def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
-    """Write poses, transforms and markers at each stamp."""
     for topic, kind in (("swarm/poses", SWARM_POSES), ("tf", TRANSFORMS), ("swarm/markers", MARKERS)):
         writer.add_topic(topic, kind)
     names = [robot.name for robot in result.swarm.robots]
@@ -192,8 +189,6 @@ def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage
     """Every `stride`-th output of a run as a message; ages of fixes are not known."""
     names = tuple(robot.name for robot in result.swarm.robots)
     not_kept = np.full(len(names), np.nan)
-    for k in range(0, len(result.stamp_ns), stride):
-        pose = result.poses[k]
-        stamp_ns, covariance = int(result.stamp_ns[k]), result.covariances[k]
-        states = result.status[k], result.heading_known[k]
-        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, *states)
+    columns = result.stamp_ns, result.poses, result.covariances, result.status, result.heading_known
+    for stamp_ns, pose, covariance, *states in zip(*(one[::stride] for one in columns), strict=True):
+        yield EstimateMessage(int(stamp_ns), _MAP, names, pose, covariance, not_kept, *states)

@@ -228,10 +228,9 @@ class Recorder(Node):
     def result(self, title: str, swarm: Swarm, truth: Mapping[str, Trajectory]) -> ReplayResult:
         """All poses so far, at least one, with ground truth and the counts of dropped inputs."""
         poses = self.poses()
-        stamp_ns = np.array([one.stamp_ns for one in poses], dtype=np.int64)
-        pose, covariance = np.array([one.pose for one in poses]), np.array([one.covariance for one in poses])
-        status, known = (
-            np.array([getattr(one, name) for one in poses]) for name in ("status", "heading_known")
+        names = ("stamp_ns", "pose", "covariance", "status", "heading_known")
+        stamp_ns, pose, covariance, status, known = (
+            np.array([getattr(one, name) for one in poses]) for name in names
         )
         result = ReplayResult(title, swarm, stamp_ns, pose, covariance, status, heading_known=known)
         return replace(result, truth=truth, counters=dict(self.drops))
@@ -244,14 +243,10 @@ class Recorder(Node):
         own = [status for status in message.status if status.name == _ESTIMATOR]
         if not own:  # of another node
             return
-        taken = _taken(message.status)
-        self.taken[nanoseconds(message.header.stamp)] = taken
+        taken = self.taken[nanoseconds(message.header.stamp)] = _taken(message.status)
         self.inputs = sum(taken.values())
-        self.drops = {
-            value.key.removeprefix(_DROPPED): int(value.value)
-            for value in own[0].values
-            if value.key.startswith(_DROPPED)
-        }
+        dropped = [value for value in own[0].values if value.key.startswith(_DROPPED)]
+        self.drops = {value.key.removeprefix(_DROPPED): int(value.value) for value in dropped}
         self.diagnostics += 1
 
 
@@ -401,17 +396,8 @@ def play_live(
     received_ns = np.array(recorder.received_ns, dtype=np.int64)
     # 0 before the first /clock
     age_s: FloatArray = 1e-9 * (received_ns - result.stamp_ns)[received_ns > 0].astype(np.float64)
-    return LiveRun(
-        result,
-        content.arrival_ns,
-        recorder.taken,
-        options.rate,
-        recorder.inputs,
-        core,
-        age_s,
-        start_up_s,
-        memory_mb,
-    )
+    heard = content.arrival_ns, recorder.taken, options.rate, recorder.inputs
+    return LiveRun(result, *heard, core, age_s, start_up_s, memory_mb)
 
 
 def _player_of(player: NodeSpec, inputs: Sequence[str], *, inputs_only: bool) -> NodeSpec:

@@ -9,14 +9,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.grid import OccupancyMap
@@ -24,6 +22,7 @@ from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, inputs_of
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.recorded_bag import TruthReader, mounts_of_bag, renamed_topics
+from swarm_loc_estimator.offline.report.plots import save
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _REPORT_EVERY = 1000
@@ -130,13 +129,12 @@ def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], wall
 
 def _stop_errors(mapper: CooperativeMapper, truth: Mapping[int, Trajectory]) -> FloatArray:
     """Estimated minus true poses (n, 3) of the stops that have ground truth."""
-    errors = []
+    errors = [np.zeros((0, 3))]
     for stop, begin_ns in mapper.begin_ns.items():
-        track = truth.get(int(mapper.graph.robot[stop]))
-        if track is not None:
+        if (track := truth.get(int(mapper.graph.robot[stop]))) is not None:
             pose, known = interpolate(track, np.array([begin_ns]), DEFAULT_GAP_NS)
-            errors += [mapper.graph.states[stop, :3] - pose[0]] if known[0] else []
-    off = np.array(errors).reshape(-1, 3)
+            errors.append((mapper.graph.states[stop, :3] - pose)[known])
+    off = np.concatenate(errors)
     off[:, 2] = wrap_angle(off[:, 2])
     return off
 
@@ -162,8 +160,7 @@ def draw_map(
     low = occupancy.corner
     high = low + occupancy.cell * np.array(occupancy.log_odds.shape)
     width, height = high - low
-    figure = Figure(figsize=(_WIDTH_IN, max(2.0, _WIDTH_IN * height / width)), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(_WIDTH_IN, max(2.0, _WIDTH_IN * height / width)))
     axes = figure.add_subplot()
     every = max(1, max(occupancy.log_odds.shape) // _PIXELS)
     extent = (low[0], high[0], low[1], high[1])
@@ -173,6 +170,5 @@ def draw_map(
     axes.add_collection(LineCollection(segments, colors="C0", linewidths=1.0, alpha=0.7))
     axes.plot(stops[:, 0], stops[:, 1], ".", color="C3", markersize=3.0)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title or f"{len(stops)} stops")
-    with replacing(path) as part:
-        figure.savefig(part, format="png", metadata={"Software": None})
+    save(figure, path)
     return path

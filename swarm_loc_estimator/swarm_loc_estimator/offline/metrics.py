@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -138,13 +138,7 @@ def pool(errors: Sequence[Errors]) -> Errors:
     if not errors:
         empty = np.empty((0, 3))
         return Errors(np.empty(0, np.int64), empty, empty, np.empty(0), np.empty(0, np.bool_))
-    return Errors(
-        np.concatenate([one.stamp_ns for one in errors]),
-        np.concatenate([one.error for one in errors]),
-        np.concatenate([one.sigma for one in errors]),
-        np.concatenate([one.nees for one in errors]),
-        np.concatenate([one.misleading for one in errors]),
-    )
+    return Errors(*(np.concatenate([getattr(one, each.name) for one in errors]) for each in fields(Errors)))
 
 
 def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
@@ -165,7 +159,6 @@ def _alone(stamp_ns: IntArray, max_gap_ns: int) -> npt.NDArray[np.bool_]:
 
 
 def _nearest(stamp_ns: IntArray, query_ns: IntArray) -> npt.NDArray[np.intp]:
-    """(M,) index of the closest stamp."""
     if len(query_ns) == 0:
         return np.empty(0, np.intp)
     after = np.searchsorted(stamp_ns, query_ns).clip(1, max(len(stamp_ns) - 1, 1))

@@ -418,9 +418,7 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
     for kind in kinds().values():
         if not kind.of_each or kind.name not in read or kind.rows in used or not kind.is_expected_of(swarm):
             continue
-        own = {
-            topic.name: statistics.malformed for topic, statistics in pairs if topic.kind.rows == kind.rows
-        }
+        own = {topic.name: one.malformed for topic, one in pairs if topic.kind.rows == kind.rows}
         others = [
             topic
             for topic in topics
@@ -428,19 +426,16 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
             and topic.name not in ingest.handle_of
             and not topic.name.endswith("/ground_truth")
         ]
+        here = [topic for topic in topics if topic.name in own]
         if malformed := sum(own.values()):
-            found = f"none of the {malformed} messages on {_listed([t for t in topics if t.name in own])}"
-            found += " is one as ROS 2 serializes it"
-        elif wrong := [topic for topic in topics if topic.name in own]:
-            found = f"the bag has another type on {_listed(wrong)}"
-        elif others and kind.of_pairs:
-            found = (
-                f"the bag has this type on {_listed(others)}: correct range_topic, and the name or address"
-            )
-            found += " of each radio"
+            found = f"none of the {malformed} messages on {_listed(here)} is one as ROS 2 serializes it"
+        elif here:
+            found = f"the bag has another type on {_listed(here)}"
         elif others:
-            found = f"the bag has this type on {_listed(others)}: map topics,"
-            found += f" such as --remap '{_rule(kind.pattern, others[0].name, swarm)}'"
+            remedy = "correct range_topic, and the name or address of each radio"
+            if not kind.of_pairs:
+                remedy = f"map topics, such as --remap '{_rule(kind.pattern, others[0].name, swarm)}'"
+            found = f"the bag has this type on {_listed(others)}: {remedy}"
         elif not used:
             found = "the bag has no topic of this type"
         else:
@@ -461,7 +456,6 @@ def _rule(pattern: str, stored: str, swarm: Swarm) -> str:
 
 
 def _listed(topics: Sequence[BagTopic]) -> str:
-    """Names and types of a few topics."""
     return listed([f"{topic.name} ({topic.type or 'no type'})" for topic in topics])
 
 

@@ -320,7 +320,6 @@ class Runner:
                 self._losses_left -= 1
 
     def _flush(self) -> None:
-        """Move the ticks in memory to the temporary file."""
         for name, column in zip(_COLUMNS, zip(*self._ticks, strict=True), strict=False):
             self._spool.append(name, np.array(column))
         self._ticks.clear()

@@ -153,15 +153,9 @@ class ReplayResult:
 
     def select(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
         """The result with only the poses at some of the stamps (T,)."""
-        return replace(
-            self,
-            stamp_ns=self.stamp_ns[rows],
-            poses=self.poses[rows],
-            covariances=self.covariances[rows],
-            status=self.status[rows],
-            heading_known=self.heading_known[rows],
-            is_local=self.is_local[rows] if self.is_local.size else self.is_local,
-        )
+        names = ["stamp_ns", "poses", "covariances", "status", "heading_known"]
+        names += ["is_local"] * bool(self.is_local.size)
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def track(self, index: int) -> Trajectory:
         """The estimated poses of a robot (index) while it is located."""

@@ -58,28 +58,18 @@ def is_rotation(quaternion: FloatArray) -> bool:
 
 
 @cached_njit
-def to_level_frame(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
-    """Rotate a vector (3,) from the optical frame to the camera's level axes forward, left, up."""
+def to_level_frame(level: FloatArray, optical: FloatArray, factor: float, out: FloatArray) -> None:
+    """Write a vector (3,) of the optical frame along the level axes forward, left, up, times a factor."""
     for i in range(3):
-        out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
-
-
-@cached_njit
-def scale(vector: FloatArray, factor: float) -> None:
-    """Multiply a vector (3,), in place."""
-    for i in range(3):
-        vector[i] *= factor
+        out[i] = (level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]) * factor
 
 
 @cached_njit
 def write_rotation(quaternion: FloatArray, out: FloatArray) -> None:
     """Write the rotation matrix (3, 3) of a quaternion xyzw (4,) of any length."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    out[0, 0], out[1, 1], out[2, 2] = (
-        w * w + x * x - y * y - z * z,
-        w * w - x * x + y * y - z * z,
-        w * w - x * x - y * y + z * z,
-    )
+    out[0, 0], out[1, 1] = w * w + x * x - y * y - z * z, w * w - x * x + y * y - z * z
+    out[2, 2] = w * w - x * x - y * y + z * z
     out[0, 1], out[0, 2], out[1, 2] = 2.0 * (x * y - w * z), 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
     out[1, 0], out[2, 0], out[2, 1] = 2.0 * (x * y + w * z), 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
     out /= x * x + y * y + z * z + w * w
@@ -90,7 +80,7 @@ def face_heading(level: FloatArray, quaternion: FloatArray) -> float:
     """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the normal of a face."""
     rotation, axes = np.empty((3, 3)), np.empty(3)
     write_rotation(quaternion, rotation)
-    to_level_frame(level, rotation[:, 2], axes)
+    to_level_frame(level, rotation[:, 2], 1.0, axes)
     return math.atan2(axes[1], axes[0])
 
 
@@ -113,17 +103,11 @@ def cast(
     value: FloatArray,
     noise: FloatArray,
 ) -> int:
-    """Write the pose of a lying marker in the level frame of a camera.
+    """Write the pose of a lying marker in the level frame of a camera, which `level` (3, 3) rotates to.
 
-    Args:
-        level: (3, 3) from the optical frame to the level frame: forward, left, up.
-        position: (3,) of the marker in the optical frame [m].
-        rotation: (3, 3) from the marker's frame to the optical frame.
-        spread: (6, 6) covariance of position and rotation about the axes of the optical frame.
-        size: Side of the marker [m].
-        height: Of the marker above the camera, negative below it [m].
-        value: (3,) written: forward, left [m], direction of the marker's x axis [rad].
-        noise: (3, 3) written: covariance of `value`.
+    Its position (3,), its rotation (3, 3) and their covariance (6, 6) are in the optical frame, its height is
+    above the camera [m]. Written are forward, left [m] and the direction of the marker's x axis [rad], and
+    the covariance (3, 3) of these.
 
     Returns:
         CAST; or FACE_DOWN or NOT_FLAT, and nothing is written.
@@ -258,48 +242,65 @@ def convert_all(
         with_heading = detections[k].content in (CONTENT_POSE, CONTENT_POSE_TWO)
         out.has_heading[k] = with_heading and not math.isnan(out.marker[k, 2])
         if detections[k].content == CONTENT_BEARING:
-            _measure_bearing(detections[k].position, k, cameras, out)
+            sensor, position = cameras.sensor[camera], np.empty(3)
+            to_level_frame(cameras.level[camera], detections[k].position, 1.0, position)
+            out.model[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
+            out.value[k, 0] = _calibrated_bearing(sensor, position)
+            out.covariance[k, 0, 0] = sensor.bearing_sigma**2
+            out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
             continue
         if markers.lies[place]:
             outcomes[k] = _measure_lying(detections, k, cameras, markers, place, out)
         else:
             _measure_upright(detections, k, cameras, out)
-        _add_face_noise(markers.variance[place], k, out)
-
-
-@cached_njit
-def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: Measurements) -> None:
-    """Write value and covariance of measurement k of a direction (3,) in the optical frame."""
-    camera, position = out.observer[k], np.empty(3)
-    sensor = cameras.sensor[camera]
-    to_level_frame(cameras.level[camera], optical, position)
-    out.model[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
-    out.value[k, 0] = _calibrated_bearing(sensor, position)
-    out.covariance[k, 0, 0] = sensor.bearing_sigma**2
-    out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
+        # the variance of the position of its face
+        distance2 = max(out.value[k, 0] ** 2, 1e-6) if out.model[k] == POLAR else 1.0
+        out.covariance[k, 0, 0] += markers.variance[place]
+        out.covariance[k, 1, 1] += markers.variance[place] / distance2
 
 
 @cached_njit
 def _measure_upright(detections: NDArray[np.void], k: int, cameras: Cameras, out: Measurements) -> None:
     """Write value and covariance of measurement k of an upright marker."""
     sensor, level = cameras.sensor[out.observer[k]], cameras.level[out.observer[k]]
-    position = np.empty(3)
-    to_level_frame(level, detections[k].position, position)
-    scale(position, 1.0 / sensor.distance_scale)
+    position, noise = np.empty(3), out.covariance[k]
+    to_level_frame(level, detections[k].position, 1.0 / sensor.distance_scale, position)
+    # Without heading: calibrated range and bearing, see `SensorModel`.
     if not out.has_heading[k]:
         out.model[k], out.marker[k, 2] = POLAR, 0.0
-        _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
+        logged = math.atan2(position[1], position[0])
+        curve = sensor.range_log_scale + sensor.range_skew * logged + sensor.range_curve * logged * logged
+        distance = math.hypot(position[0], position[1]) * math.exp(curve) + sensor.range_offset
+        if out.target[k] != NOBODY:
+            distance += sensor.robot_range_offset
+        out.value[k, 0], out.value[k, 1] = distance, _calibrated_bearing(sensor, position)
+        noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
+        noise[1, 1], noise[2, 2] = sensor.bearing_sigma**2, 1.0
         return
+    # Position and heading, of a second solution, too.
     out.value[k, 0], out.value[k, 1] = position[0], position[1]
     out.value[k, 2] = face_heading(level, detections[k].orientation)
     if detections[k].content == CONTENT_POSE_TWO:
         out.has_second[k] = True
-        to_level_frame(level, detections[k].alternative_position, position)
-        scale(position, 1.0 / sensor.distance_scale)
+        to_level_frame(level, detections[k].alternative_position, 1.0 / sensor.distance_scale, position)
         out.second[k, 0], out.second[k, 1] = position[0], position[1]
         out.second[k, 2] = face_heading(level, detections[k].alternative_orientation)
-    distance = math.hypot(out.value[k, 0], out.value[k, 1])
-    _pose_noise(sensor, level, detections[k].covariance, distance, out.covariance[k])
+    # Covariance of forward, left, heading, by the model if unknown (-1, 0).
+    published = detections[k].covariance
+    if published[0, 0] <= 0.0:
+        noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
+        noise[2, 2] = sensor.heading_sigma**2
+        return
+    to_plane = np.zeros((3, 6))
+    for i in range(3):
+        to_plane[0, i], to_plane[1, i] = level[0, i], level[1, i]
+        to_plane[2, 3 + i] = level[2, i]  # the rotation about the vertical
+    for i in range(3):
+        for j in range(3):
+            for a in range(6):
+                for b in range(6):
+                    noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
+    _add_residual(sensor, math.hypot(out.value[k, 0], out.value[k, 1]), noise)
 
 
 @cached_njit
@@ -310,7 +311,15 @@ def _measure_lying(
     camera = out.observer[k]
     sensor, level = cameras.sensor[camera], cameras.level[camera]
     spread, position, rotation = np.zeros((6, 6)), np.empty(3), np.empty((3, 3))
-    _write_spread(sensor, detections[k].content, detections[k].covariance, spread)
+    # Covariance of the pose in the optical frame, by the model if unknown (-1, 0).
+    if detections[k].content != CONTENT_POSITION and detections[k].covariance[0, 0] > 0.0:
+        spread[:] = detections[k].covariance
+    else:
+        spread[0, 0] = spread[1, 1] = sensor.left_sigma**2
+        spread[2, 2] = sensor.forward_sigma**2
+        for i in range(3, 6):
+            spread[i, i] = sensor.heading_sigma**2
+    # The solution that lies.
     height, result = markers.height[place] - cameras.height[camera], CAST
     for solution in range(2 if detections[k].content == CONTENT_POSE_TWO else 1):
         assign(position, detections[k].alternative_position if solution else detections[k].position)
@@ -332,14 +341,6 @@ def _measure_lying(
         out.covariance[k, 2, :] = out.covariance[k, :, 2] = 0.0
         out.covariance[k, 2, 2] = 1.0
     return MEASURED
-
-
-@cached_njit
-def _add_face_noise(variance: float, k: int, out: Measurements) -> None:
-    """Add the variance of a face's position to measurement k."""
-    out.covariance[k, 0, 0] += variance
-    distance2 = max(out.value[k, 0] ** 2, 1e-6) if out.model[k] == POLAR else 1.0
-    out.covariance[k, 1, 1] += variance / distance2
 
 
 @inlined_njit
@@ -392,62 +393,12 @@ def _calibrated_bearing(sensor: SensorModel, position: FloatArray) -> float:
 
 
 @cached_njit
-def _calibrate(
-    sensor: SensorModel, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
-) -> None:
-    """Write calibrated range and bearing (3,) and their covariance (3, 3); see `SensorModel`."""
-    logged = math.atan2(position[1], position[0])
-    curve = sensor.range_log_scale + sensor.range_skew * logged + sensor.range_curve * logged * logged
-    distance = math.hypot(position[0], position[1]) * math.exp(curve) + sensor.range_offset
-    if target != NOBODY:
-        distance += sensor.robot_range_offset
-    value[0] = distance
-    value[1] = _calibrated_bearing(sensor, position)
-    noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
-    noise[1, 1] = sensor.bearing_sigma**2
-    noise[2, 2] = 1.0
-
-
-@cached_njit
-def _pose_noise(
-    sensor: SensorModel, level: FloatArray, published: FloatArray, distance: float, noise: FloatArray
-) -> None:
-    """Write the covariance (3, 3) of forward, left, heading; by the model if unknown (-1, 0)."""
-    if published[0, 0] <= 0.0:
-        noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
-        noise[2, 2] = sensor.heading_sigma**2
-        return
-    to_plane = np.zeros((3, 6))
-    for i in range(3):
-        to_plane[0, i], to_plane[1, i] = level[0, i], level[1, i]
-        to_plane[2, 3 + i] = level[2, i]  # the rotation about the vertical
-    for i in range(3):
-        for j in range(3):
-            for a in range(6):
-                for b in range(6):
-                    noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
-    _add_residual(sensor, distance, noise)
-
-
-@cached_njit
 def _add_residual(sensor: SensorModel, distance: float, noise: FloatArray) -> None:
     """Add the residual errors of a camera to the covariance (3, 3) of the planar pose, and the floor."""
     floor = _FLOOR_M + _FLOOR_SHARE * distance
     noise[0, 0] += sensor.residual_position_sigma**2 + floor**2
     noise[1, 1] += sensor.residual_position_sigma**2 + floor**2
     noise[2, 2] += sensor.residual_heading_sigma**2 + _FLOOR_RAD**2
-
-
-@cached_njit
-def _write_spread(sensor: SensorModel, content: int, published: FloatArray, spread: FloatArray) -> None:
-    """Write the covariance (6, 6) of a pose in the optical frame; by the model if unknown (-1, 0)."""
-    if content != CONTENT_POSITION and published[0, 0] > 0.0:
-        spread[:] = published
-        return
-    spread[0, 0] = spread[1, 1] = sensor.left_sigma**2
-    spread[2, 2] = sensor.forward_sigma**2
-    for i in range(3, 6):
-        spread[i, i] = sensor.heading_sigma**2
 
 
 _UNKNOWN_VARIANCE = -1.0  # First element of an unknown covariance
@@ -480,12 +431,7 @@ NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYP
 
 
 class SightingConverter:
-    """Converts the detections of all cameras of a swarm.
-
-    Args:
-        swarm: Cameras, their calibration, and owners of markers.
-        drops: Where dropped detections are counted, by the reasons in `OUTCOMES`.
-    """
+    """Converts the detections of all cameras of a swarm; dropped ones are counted by `OUTCOMES`."""
 
     def __init__(self, swarm: Swarm, drops: DropCounts | None = None) -> None:
         self._drops = drops or DropCounts(len(swarm.sources))
@@ -538,20 +484,14 @@ class SightingConverter:
         fixed = out.observer >= self._cameras.robots
         out.mount[fixed] = out.observer[fixed] - self._cameras.robots + self._first_mount
         out.observer[fixed] = NOBODY
-        self._note_stamp_variance(out)
-        return out
-
-    def _note_stamp_variance(self, measurements: Measurements) -> None:
-        """Write the variance of the stamps.
-
-        All measurements of an image share the error of its stamp. The filter assumes independent errors, so
-        each measurement gets the variance times their number.
-        """
-        variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements.received_from]
+        # All measurements of an image share the error of its stamp. The filter assumes independent errors, so
+        # each measurement gets the variance times their number.
+        variance = np.square(self._cameras.sensor["time_sigma_s"])[out.received_from]
         if variance.any():
-            pictures = np.stack([measurements.received_from, measurements.stamp_ns])
+            pictures = np.stack([out.received_from, out.stamp_ns])
             _, picture, count = np.unique(pictures, axis=1, return_inverse=True, return_counts=True)
-            measurements.stamp_variance[:] = variance * count[picture]
+            out.stamp_variance[:] = variance * count[picture]
+        return out
 
 
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:

@@ -48,27 +48,18 @@ class TurnRateSensor(Sensor):
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)
         # last row of Ry(pitch) Rx(roll): what rates about the axes of the IMU turn about the vertical
-        self._vertical = np.array(
-            [
-                [
-                    -math.sin(one.pitch),
-                    math.cos(one.pitch) * math.sin(one.roll),
-                    math.cos(one.pitch) * math.cos(one.roll),
-                ]
-                for one in (robot.imu for robot in swarm.robots)
-            ]
-        ).reshape(-1, 3)
+        tilts = [(robot.imu.pitch, robot.imu.roll) for robot in swarm.robots]
+        rows = [(-math.sin(p), math.cos(p) * math.sin(r), math.cos(p) * math.cos(r)) for p, r in tilts]
+        self._vertical = np.array(rows).reshape(-1, 3)
 
     @classmethod
     def columns(cls, messages: Messages[Any]) -> TurnRateRows:
         """Convert decoded messages (n,); a first covariance of -1 says that there is no rate."""
-        velocity = np.array(
-            [
-                (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z)
-                for message in messages.decoded
-            ],
-            dtype=float,
-        ).reshape(-1, 3)
+        rates = [
+            (one.angular_velocity.x, one.angular_velocity.y, one.angular_velocity.z)
+            for one in messages.decoded
+        ]
+        velocity = np.array(rates, dtype=float).reshape(-1, 3)
         # the convention of sensor_msgs
         has_none = [message.angular_velocity_covariance[0] == -1.0 for message in messages.decoded]
         rate = np.where(has_none, -np.inf, np.nan)

@@ -65,21 +65,12 @@ class ExchangeKey(NamedTuple):
 
 
 class MatrixScreening:
-    """Validates the matrices of a swarm's infrared boards.
-
-    Args:
-        swarm: Robots with their boards.
-
-    Attributes:
-        boards: Board by robot; robots without a board are omitted.
-        dropped: Number of unusable matrices by reason.
-    """
+    """Validates the matrices of a swarm's infrared boards."""
 
     def __init__(self, swarm: Swarm) -> None:
-        self.boards: dict[int, RobotIr] = {
-            k: robot.ir for k, robot in enumerate(swarm.robots) if robot.ir is not None
-        }
-        self.dropped: Counter[str] = Counter()
+        # Board by robot, of those that have one
+        self.boards: dict[int, RobotIr] = {k: r.ir for k, r in enumerate(swarm.robots) if r.ir is not None}
+        self.dropped: Counter[str] = Counter()  # Number of unusable matrices by reason
         self._robot_of = {ir.id: robot for robot, ir in self.boards.items()}
 
     def key_of(self, rows: BrightnessRows, k: int) -> ExchangeKey | None:
@@ -104,10 +95,7 @@ class MatrixScreening:
         readings[power] = matrix
 
     def together(self, robot: int, exchanges: list[Readings]) -> tuple[FloatArray, FloatArray]:
-        """Readings (k, modes, n, n) of exchanges of a robot's board, NaN where not measured, and saturation.
-
-        Saturation is (k, modes).
-        """
+        """Readings (k, modes, n, n) of exchanges of a board, NaN if not measured; saturation (k, modes)."""
         platform = self.boards[robot].platform
         whole = np.full((len(exchanges), len(platform.amplitudes), platform.n, platform.n), np.nan)
         saturation = np.full(whole.shape[:2], platform.saturation)
@@ -152,11 +140,7 @@ def _estimator(platform: IrPlatform) -> MaximumLikelihood:
 
 
 class BrightnessConverter:
-    """Stores recent exchanges and converts them to measurements.
-
-    Args:
-        swarm: Robots with their boards.
-    """
+    """Stores recent exchanges of the boards of a swarm and converts them to measurements."""
 
     def __init__(self, swarm: Swarm) -> None:
         self._validator = MatrixScreening(swarm)
@@ -175,14 +159,10 @@ class BrightnessConverter:
         return self._validator.dropped + self._dropped + _faults(self._exchanges.values())
 
     @property
-    def measured(self) -> int:
-        """Number of exchanges with a measurement since the last `restart`."""
-        return self._measured + sum(exchange.measurement.size for exchange in self._exchanges.values())
-
-    @property
     def counters(self) -> dict[str, int]:
         """Numbers of used data by name, since the last `restart`."""
-        return {"infrared exchanges measured": self.measured}
+        kept = sum(exchange.measurement.size for exchange in self._exchanges.values())
+        return {"infrared exchanges measured": self._measured + kept}
 
     def forget_before(self, oldest_ns: int) -> None:
         """Discard the exchanges before an instant."""
@@ -202,7 +182,10 @@ class BrightnessConverter:
                 self._validator.add(rows, k, self._exchanges.setdefault(key, _Exchange()).readings)
                 touched[key] = None
         added, withdrawn = [NO_MEASUREMENTS], [NO_MEASUREMENTS]
-        for keys in self._alike(touched):
+        groups: dict[MaximumLikelihood, list[ExchangeKey]] = {}  # By board
+        for key in touched:
+            groups.setdefault(_estimator(self._ir[key.receiver].platform), []).append(key)
+        for keys in groups.values():
             for exchange, measurement in self._solved(keys):
                 withdrawn.append(exchange.measurement)
                 added.append(measurement)
@@ -215,13 +198,6 @@ class BrightnessConverter:
         self._dropped += _faults(gone)
         self._measured += sum(exchange.measurement.size for exchange in gone)
 
-    def _alike(self, keys: Iterable[ExchangeKey]) -> Iterable[list[ExchangeKey]]:
-        """Group exchanges by board."""
-        groups: dict[MaximumLikelihood, list[ExchangeKey]] = {}
-        for key in keys:
-            groups.setdefault(_estimator(self._ir[key.receiver].platform), []).append(key)
-        return groups.values()
-
     def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, Measurements]]:
         """Exchanges of one group whose measurement changes, with the new one, (1,) or (0,)."""
         ir = self._ir[keys[0].receiver]
@@ -233,9 +209,8 @@ class BrightnessConverter:
         faults = reject_reasons(measurements)
         changed = []
         for k, exchange in enumerate(exchanges):
-            exchange.fault = (
-                _reason(int(solutions.outcomes[k]), readings[k], limits[k]) or REJECT_REASONS[faults[k]]
-            )
+            fault = _reason(int(solutions.outcomes[k]), readings[k], limits[k])
+            exchange.fault = fault or REJECT_REASONS[faults[k]]
             measurement = NO_MEASUREMENTS if exchange.fault else select(measurements, slice(k, k + 1))
             if not measurement.equals(exchange.measurement):
                 changed.append((exchange, measurement))
@@ -291,20 +266,13 @@ class BrightnessSensor(Sensor):
         for k, message in enumerate(messages.decoded):
             readings[k] = message.readings
 
-        def column(name: str) -> IntArray:
-            return np.array([getattr(message, name) for message in messages.decoded], dtype=np.int64)
-
-        return BrightnessRows(
-            robot=messages.robot,
-            stamp_ns=messages.stamp_ns,
-            receiver=column("receiver"),
-            transmitter=column("transmitter"),
-            n=column("n"),
-            power=column("power"),
-            saturation=column("saturation"),
-            readings=readings,
-            arrival_ns=messages.arrival_ns,
+        names = ("receiver", "transmitter", "n", "power", "saturation")
+        numbers = [[getattr(message, name) for message in messages.decoded] for name in names]
+        receiver, transmitter, n, power, saturation = np.array(numbers, dtype=np.int64).reshape(
+            len(names), -1
         )
+        sides = messages.robot, messages.stamp_ns, receiver, transmitter
+        return BrightnessRows(*sides, n, power, saturation, readings, messages.arrival_ns)
 
     @classmethod
     def expected_of(cls, robot: Robot) -> bool:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.streams import MessageBatch
@@ -168,15 +168,10 @@ def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
     return tuple(
         replace(topic, expected=topic.kind.is_expected_of(swarm)) if topic.kind.is_shared else topic
         for topic in input_topics(swarm)
-        if topic.robot == THE_SWARM or _is_sent(topic, swarm, stood_for)
+        if topic.robot == THE_SWARM
+        or topic.robot >= len(swarm.robots)  # of a fixed camera
+        or (topic.kind.rows not in stood_for and topic.kind.expected_of(swarm.robots[topic.robot]))
     )
-
-
-def _is_sent(topic: InputTopic, swarm: Swarm, stood_for: Collection[str]) -> bool:
-    """Whether the robot or fixed camera publishes this topic and no shared topic replaces it."""
-    if topic.robot >= len(swarm.robots):
-        return True
-    return topic.kind.rows not in stood_for and topic.kind.expected_of(swarm.robots[topic.robot])
 
 
 @dataclass(frozen=True)
@@ -212,11 +207,8 @@ class Batch:
     ) -> Batch:
         """Create a batch from columns by sensor, see `Estimator.step`.
 
-        Args:
-            swarm: Gives the indices of robots and fixed cameras.
-            begin_ns: Instant before which nothing can arrive any more.
-            now_ns: Latest arrival; readings without `arrival_ns` arrive at their stamps, but not later.
-            readings: Columns by the names of sensors.
+        Nothing arrives before `begin_ns`; readings without `arrival_ns` arrive at their stamps, but not after
+        `now_ns`.
 
         Raises:
             TypeError: There is no such sensor, robot or column, or a column has another length or shape.
@@ -242,10 +234,14 @@ class Batch:
 
     def until_each(self, stamps_ns: IntArray) -> Iterator[Batch]:
         """Split at instants (s,) into s + 1 parts by arrival time."""
-        places = {name: _between(one.arrival_ns, stamps_ns) for name, one in self.rows.items()}
+        places = {
+            name: [0, *np.searchsorted(one.arrival_ns, stamps_ns).tolist(), one.arrival_ns.size]
+            for name, one in self.rows.items()
+        }
         begin_ns = self.begin_ns
         for k, end_ns in enumerate([*stamps_ns.tolist(), self.end_ns]):
-            rows = {name: select(one, places[name][k]) for name, one in self.rows.items()}
+            parts = {name: slice(*places[name][k : k + 2]) for name in self.rows}
+            rows = {name: select(one, parts[name]) for name, one in self.rows.items()}
             dropped = {} if k else self.dropped
             yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows, dropped=dropped)
             begin_ns = end_ns
@@ -290,27 +286,12 @@ def _robots(swarm: Swarm, sensor: str, given: Mapping[str, Any], count: int) -> 
     return found
 
 
-def _between(arrivals_ns: IntArray, stamps_ns: IntArray) -> list[slice]:
-    """Split sorted arrivals (k,) at instants (s,) into s + 1 slices."""
-    ends = [*np.searchsorted(arrivals_ns, stamps_ns).tolist(), arrivals_ns.size]
-    return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
-
-
 class InputConverter:
-    """Converts batches to measurements.
-
-    Args:
-        swarm: Swarm with the sensors.
-        settings: Default noise of sensors, and tolerance of stamps in the future.
-
-    Attributes:
-        drops: Counts dropped readings.
-        accumulators: Accumulators by sensor.
-    """
+    """Converts batches of a swarm to measurements; what is dropped is counted in `drops`."""
 
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
         self.drops = DropCounts(len(swarm.sources))
-        self.accumulators: dict[str, Accumulator] = {
+        self.accumulators: dict[str, Accumulator] = {  # By sensor
             name: sensor.accumulator(swarm)
             for name, sensor in SENSORS.items()
             if sensor.accumulator is not None
@@ -353,30 +334,15 @@ MAX_PAUSE_NS = 3_600_000_000_000
 
 CLOCKS_APART_S = 0.2  # Difference between the clock of a robot and those of the others that is named [s]
 
-_STATISTICS_DTYPE = np.dtype(
-    [
-        (name, np.float64 if name == "late_sum_ns" else np.int64)  # a sum of absurd delays exceeds int64
-        for name in (
-            "received",
-            "malformed",
-            "last_stamp_ns",
-            "first_arrival_ns",
-            "last_arrival_ns",
-            "late_sum_ns",
-            "late_min_ns",
-            "late_max_ns",
-            "late_count",
-        )
-    ]
-)
+_OF_MESSAGES = ("received", "malformed", "last_stamp_ns", "first_arrival_ns", "last_arrival_ns")
+_LATE = ("late_sum_ns", "late_min_ns", "late_max_ns", "late_count")
+# as floats, since a sum of absurd delays exceeds int64
+_TYPES = {"late_sum_ns": np.float64}
+_STATISTICS_DTYPE = np.dtype([(name, _TYPES.get(name, np.int64)) for name in (*_OF_MESSAGES, *_LATE)])
 
 
 class InputStatistics:
-    """Message statistics of one topic.
-
-    Args:
-        row: (1,) of _STATISTICS_DTYPE, the counters.
-    """
+    """Message statistics of one topic, by a row (1,) of counters."""
 
     def __init__(self, row: NDArray[np.void]) -> None:
         self._row = row
@@ -429,7 +395,7 @@ class InputStatistics:
 
     def restart(self) -> None:
         """Start a new interval for the delays."""
-        for name in ("late_sum_ns", "late_min_ns", "late_max_ns", "late_count"):
+        for name in _LATE:
             self._row[name] = 0
 
 
@@ -455,23 +421,15 @@ class WrongClock(NamedTuple):
 
 
 class Ingest:
-    """Decodes the messages of a swarm's topics.
+    """Decodes the messages of a swarm's topics, of all possible ones if None are given.
 
-    Args:
-        swarm: Swarm with the topics.
-        map_frame: Name of the frame `map` in messages.
-        topics: Input topics; None: all possible topics of the swarm.
-
-    Attributes:
-        topics: Input topics; the index is the topic's number in a batch.
-        handle_of: Topic number by name.
-        statistics: Statistics of each topic.
-        map_frame: Name of the frame `map`.
+    `map_frame` is the name of the frame `map` in messages.
     """
 
     def __init__(
         self, swarm: Swarm, map_frame: str = "map", topics: tuple[InputTopic, ...] | None = None
     ) -> None:
+        # The index is the topic's number in a batch
         self.topics = input_topics(swarm) if topics is None else topics
         self.map_frame = map_frame
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
@@ -560,11 +518,7 @@ class Ingest:
 
 @cached_njit
 def _count(
-    counted: NDArray[np.void],
-    topic: IntArray,
-    arrival_ns: IntArray,
-    stamp_ns: IntArray,
-    valid: NDArray[np.bool_],
+    counted: NDArray[np.void], topic: IntArray, arrival_ns: IntArray, stamp_ns: IntArray, valid: BoolArray
 ) -> None:
     """Add messages (n,) to the statistics (t,) of their topics."""
     for k in range(topic.size):

@@ -140,7 +140,7 @@ class DelayBelief(NamedTuple):
     covariance: FloatArray  # (3, 3) of this pose, by its own axes
     track: FloatArray  # (L, 3) this pose by odometry, at each lag
     backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
-    noise: float = 1.0  # Usual squares of the best lag: how much worse odometry is than assumed
+    noise: float = 1.0  # Mean of recent squares: how much worse odometry is than assumed
     #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
     anchor: FloatArray = _NOWHERE
 
@@ -201,8 +201,8 @@ def learned_delay(
         slip = _SLIP * (chance @ between(before.track, track))
         noise = _NEW * (own + before.covariance) + np.diag(slip**2)
         squares = (error @ np.linalg.inv(noise) * error).sum(axis=-1)
-        least = float(squares.min()) / 3.0
-        noisiness = max(1.0, noisiness + _NOISE_SHARE * (min(least, _WILD) - noisiness))
+        usual = min(float(chance @ np.diag(squares)) / 3.0, _WILD)
+        noisiness = max(1.0, noisiness + _NOISE_SHARE * (usual - noisiness))
         # a sweep that turned otherwise than at the likeliest lag was straightened wrongly
         turned = np.gradient(np.unwrap(track[:, 2])) * (1e-9 * since_ns / _STEP_S)
         bent = 1.0 + (_BENT * (turned - turned[chance.argmax()])) ** 2 / noise[2, 2]
@@ -212,7 +212,7 @@ def learned_delay(
         chance = chance @ (
             transition * (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
         )
-        chance = chance / chance.sum() if least < _WILD else before.chance
+        chance = chance / chance.sum() if squares.min() < _WILD else before.chance
     return before._replace(
         chance=chance, stamp_ns=stamp_ns, seen=seen, covariance=own, track=track, noise=noisiness
     )

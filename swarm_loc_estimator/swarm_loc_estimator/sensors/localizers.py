@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,13 +17,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.common.messages.cdr import (
-    ODOMETRY,
-    POSE_STAMPED,
-    POSE_WITH_COVARIANCE,
-    TRANSFORMS,
-    nanoseconds,
-)
+from swarm_loc_estimator.common.messages import cdr
 from swarm_loc_estimator.common.messages.poses import PLANE, encode_fix, encode_pose_stamped, yaw_of
 from swarm_loc_estimator.common.parameters import ParameterError, text
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
@@ -60,12 +55,8 @@ def _body(name: str, header: Any, place: Any, turn: Any, covariance: FloatArray 
     if math.isfinite(norm) and norm > 0.0:  # zeros or NaN: bodies that are tracked without orientation
         yaw, tilt = yaw_of(x, y, z, w), math.acos(max(1.0 - 2.0 * (x * x + y * y) / norm, -1.0))
     return BodyPose(
-        name, header.frame_id, nanoseconds(header.stamp), (place.x, place.y, yaw), tilt, covariance
+        name, header.frame_id, cdr.nanoseconds(header.stamp), (place.x, place.y, yaw), tilt, covariance
     )
-
-
-def _of_pose(message: Any) -> Iterator[BodyPose]:
-    yield _body("", message.header, message.pose.position, message.pose.orientation)
 
 
 def _of_pose_with_covariance(message: Any) -> Iterator[BodyPose]:
@@ -78,27 +69,30 @@ def _of_transforms(message: Any) -> Iterator[BodyPose]:
         yield _body(one.child_frame_id, one.header, one.transform.translation, one.transform.rotation)
 
 
-def _of_named_poses(message: Any) -> Iterator[BodyPose]:
-    for one in message.poses:
-        yield _body(one.name, message.header, one.pose.position, one.pose.orientation)
-
-
-def _of_rigid_bodies(message: Any) -> Iterator[BodyPose]:
-    for one in message.rigidbodies:
-        yield _body(one.rigid_body_name, message.header, one.pose.position, one.pose.orientation)
+def _of_poses(message: Any, poses: str = "", name: str = "") -> Iterator[BodyPose]:
+    """Those in a field of the message, named by one of theirs, or its own pose."""
+    for one in getattr(message, poses) if poses else [message]:
+        body = getattr(one, name) if name else ""
+        yield _body(body, message.header, one.pose.position, one.pose.orientation)
 
 
 SOURCES: Mapping[str, LocalizerSource] = {
-    "pose": LocalizerSource(POSE_STAMPED, f"/vrpn_mocap/{BODY}/pose", _of_pose),
+    "pose": LocalizerSource(cdr.POSE_STAMPED, f"/vrpn_mocap/{BODY}/pose", _of_poses),
     "pose_with_covariance": LocalizerSource(
-        POSE_WITH_COVARIANCE, f"{BODY}/amcl_pose", _of_pose_with_covariance
+        cdr.POSE_WITH_COVARIANCE, f"{BODY}/amcl_pose", _of_pose_with_covariance
     ),
-    "odometry": LocalizerSource(ODOMETRY, f"{BODY}/odometry/global", _of_pose_with_covariance),
-    "tf": LocalizerSource(TRANSFORMS, "/tf", _of_transforms),
+    "odometry": LocalizerSource(cdr.ODOMETRY, f"{BODY}/odometry/global", _of_pose_with_covariance),
+    "tf": LocalizerSource(cdr.TRANSFORMS, "/tf", _of_transforms),
     "named_poses": LocalizerSource(
-        "motion_capture_tracking_interfaces/msg/NamedPoseArray", "/poses", _of_named_poses
+        "motion_capture_tracking_interfaces/msg/NamedPoseArray",
+        "/poses",
+        partial(_of_poses, poses="poses", name="name"),
     ),
-    "rigid_bodies": LocalizerSource("mocap4r2_msgs/msg/RigidBodies", "/rigid_bodies", _of_rigid_bodies),
+    "rigid_bodies": LocalizerSource(
+        "mocap4r2_msgs/msg/RigidBodies",
+        "/rigid_bodies",
+        partial(_of_poses, poses="rigidbodies", name="rigid_body_name"),
+    ),
 }
 """Kinds of messages by name."""
 
@@ -145,13 +139,10 @@ class LocalizedRobots:
         # which body is which robot, and where on it
         self.robot_of = _robots_of_bodies(parameters.bodies, robots)  # Body -> robot
         offsets = _offsets(parameters.offsets, self.robot_of.values())
-        self._to_robot = {
-            robot: se2.inverse(offsets.get(robot, np.zeros(3))) for robot in self.robot_of.values()
-        }
+        self._to_robot = {one: se2.inverse(offsets.get(one, np.zeros(3))) for one in self.robot_of.values()}
         # what poses must be in, and the topics that they come on
-        self._frames = (
-            [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
-        )
+        expected = parameters.source_frame
+        self._frames = [expected] if expected else [parameters.map_frame, "world"]
         # The topic, with `BODY` if each body has its own
         self.topic = topic = parameters.topic or SOURCES[parameters.source].topic
         has_own = BODY in SOURCES[parameters.source].topic
@@ -175,9 +166,8 @@ class LocalizedRobots:
         # what is counted, and the noise of poses without covariance
         self.strangers: set[str] = set()  # Names of bodies of no robot
         self.used = 0  # Number of poses that were converted
-        self._variances = np.diag(
-            [parameters.position_sigma**2, parameters.position_sigma**2, parameters.heading_sigma**2]
-        )
+        sigma = parameters.position_sigma
+        self._variances = np.diag([sigma**2, sigma**2, parameters.heading_sigma**2])
 
     def convert(self, bodies: Iterable[BodyPose], of_topic: str, arrival_ns: int) -> Iterator[RobotPose]:
         """The poses of robots by those of the bodies of one message; what cannot be used is counted.
@@ -247,20 +237,12 @@ class LocalizedRobots:
         placed = se2.compose(pose, to_robot)
         by_heading = np.eye(3)
         by_heading[:2, 2] = pose[1] - placed[1], placed[0] - pose[0]
-        return RobotPose(
-            robot,
-            stamp_ns - round(parameters.latency_s * 1e9),
-            placed,
-            by_heading @ covariance @ by_heading.T,
-        )
+        stamp_ns -= round(parameters.latency_s * 1e9)
+        return RobotPose(robot, stamp_ns, placed, by_heading @ covariance @ by_heading.T)
 
 
 def _robots_of_bodies(selected: Collection[str], robots: Collection[str]) -> dict[str, str]:
-    """Body -> robot.
-
-    Raises:
-        ParameterError: There is no such robot, or a body or a robot is named twice.
-    """
+    """Body -> robot; raises ParameterError if there is no such robot, or if one is named twice."""
     robot_of: dict[str, str] = {}
     for one in selected or robots:
         body, _, robot = one.rpartition("=")
@@ -273,11 +255,7 @@ def _robots_of_bodies(selected: Collection[str], robots: Collection[str]) -> dic
 
 
 def _offsets(selected: Collection[str], robots: Collection[str]) -> Mapping[str, FloatArray]:
-    """Robot -> pose (3,) of its body in base_link.
-
-    Raises:
-        ParameterError: There is no such robot, or a text is no pose.
-    """
+    """Robot -> pose (3,) of its body in base_link; raises ParameterError for another robot, or no pose."""
     offset_of: dict[str, FloatArray] = {}
     for one in selected:
         robot, _, numbers = one.partition("=")

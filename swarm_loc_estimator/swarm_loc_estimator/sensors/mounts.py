@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import listed
@@ -57,11 +58,7 @@ class Said(NamedTuple):
 
 
 class Mounts:
-    """Collects static transforms and the frames of sensors.
-
-    Args:
-        swarm: The swarm as described.
-    """
+    """Collects static transforms and the frames of sensors of a described swarm."""
 
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
@@ -86,7 +83,9 @@ class Mounts:
             numbers = [*quaternion, place.x, place.y, place.z]
             if (np.abs(numbers) < _FAR).all() and quaternion.any() and len(joints) < _MAX_FRAMES:
                 parent, child = (name.lstrip("/") for name in (one.header.frame_id, one.child_frame_id))
-                joints.setdefault(child, _Joint(parent, _rotation(quaternion), np.array(numbers[4:])))
+                joints.setdefault(
+                    child, _Joint(parent, Rotation.from_quat(quaternion).as_matrix(), np.array(numbers[4:]))
+                )
 
     def add_frame(self, topic: InputTopic, frame: str) -> None:
         """Add the frame of a sensor's messages."""
@@ -174,19 +173,5 @@ class Mounts:
 def _says(robot: Robot, section: str, key: str) -> bool:
     """Whether the description says a number."""
     model: Any = getattr(robot, section)
-    return (
-        f"{section}.{key}" in robot.said
-        or getattr(model, key) != type(model).__dataclass_fields__[key].default
-    )
-
-
-def _rotation(quaternion: FloatArray) -> FloatArray:
-    """Rotation (3, 3) of a quaternion x, y, z, w of any length."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
+    default = type(model).__dataclass_fields__[key].default
+    return f"{section}.{key}" in robot.said or getattr(model, key) != default

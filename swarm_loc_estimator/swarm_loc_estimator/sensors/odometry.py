@@ -16,15 +16,7 @@ from swarm_loc_estimator.common.messages.detections import SharedMessage, decode
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.messages.streams import PoseColumns, PoseReader
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    DropCounts,
-    Known,
-    Reader,
-    Sensor,
-    SensorSettings,
-    SharedTopic,
-)
+from swarm_loc_estimator.sensors import sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _MAX_DISTANCE_M = 1e6
@@ -48,29 +40,29 @@ class OdometryRows(NamedTuple):
         return cls(robot, stamp_ns, pose, np.full(pose.shape, np.nan), arrival_ns)
 
 
-NO_ODOMETRY = OdometryRows.without_twist(NO_ROWS, NO_ROWS, np.zeros((0, 3)), NO_ROWS)
+NO_ODOMETRY = OdometryRows.without_twist(sensor.NO_ROWS, sensor.NO_ROWS, np.zeros((0, 3)), sensor.NO_ROWS)
 
 
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
     return OdometryRows.without_twist(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-class OdometrySensor(Sensor):
+class OdometrySensor(sensor.Sensor):
     """Odometry of robots; its readings are used unchanged."""
 
     name, topic, message_type = "odometry", "odom", MESSAGE_TYPE
-    shared = SharedTopic(
+    shared = sensor.SharedTopic(
         "swarm/odom", SWARM_ODOMETRY, partial(decode_shared_numbers, widths=(3,)), _shared_rows
     )
     unit = None
     optional = MappingProxyType({"twist": math.nan})
 
-    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+    def __init__(self, swarm: Swarm, settings: sensor.SensorSettings, drops: sensor.DropCounts) -> None:
         super().__init__(swarm, settings, drops)
         self._stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
 
     @classmethod
-    def create_reader(cls, topics: int, _known: Known) -> Reader:
+    def create_reader(cls, topics: int, _known: sensor.Known) -> sensor.Reader:
         """Create a reader that decodes all messages of a batch at once."""
         return PoseReader(topics, decode_odometry, names=2)
 

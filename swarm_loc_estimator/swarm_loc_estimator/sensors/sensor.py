@@ -83,18 +83,11 @@ class Reader(Protocol):
 
 
 class DropCounts:
-    """Numbers of dropped readings by reason.
-
-    Args:
-        sources: Number of robots and fixed cameras.
-
-    Attributes:
-        total: Of all readings.
-        of_robot: Of the own readings of each robot and, after them, of each fixed camera.
-    """
+    """Numbers of dropped readings by reason, of a number of robots and fixed cameras."""
 
     def __init__(self, sources: int) -> None:
-        self.total: Counter[str] = Counter()
+        self.total: Counter[str] = Counter()  #: Of all readings
+        #: Of the own readings of each robot and, after them, of each fixed camera
         self.of_robot: list[Counter[str]] = [Counter() for _ in range(sources)]
 
     def add(self, reason: str, robots: IntArray) -> None:
@@ -118,12 +111,7 @@ class DropCounts:
 class Guard:
     """A context in which an error of a sensor's code costs the readings of this sensor and no others.
 
-    A warning describes the error.
-
-    Args:
-        sensor: Its name.
-        readings: How many are lost.
-        drops: Where they are counted, by the sensor and the type of the error.
+    They are counted by the name of the sensor and the type of the error, which a warning describes.
     """
 
     def __init__(self, sensor: str, readings: int, drops: Counter[str]) -> None:
@@ -259,9 +247,8 @@ class Sensor:
     only_expected: ClassVar[bool] = False  #: True if robots of which it is not expected have no such topic
     of_cameras: ClassVar[bool] = False  #: True if each fixed camera has such a topic, too
     in_map: ClassVar[bool] = False  #: True if messages must be in the frame `map`
-    needs_map: ClassVar[bool] = (
-        False  #: True if there are such topics only with a map; of the swarm: by topic
-    )
+    #: True if there are such topics only with a map; of the swarm: by topic
+    needs_map: ClassVar[bool] = False
 
     optional: ClassVar[Mapping[str, Any]] = {}  #: Values of columns that `rows` may lack
     #: Columns that group readings: a group is used or dropped as a whole. None: never dropped
@@ -419,10 +406,9 @@ def _check_parameters(
         variance = measurements.stamp_variance[k]
         good = good and math.isfinite(variance) and variance >= 0.0
         good = good and not math.isnan(measurements.gate[k])
+        sensor, marker = measurements.sensor[k], measurements.marker[k]
         for i in range(3):
-            good = (
-                good and math.isfinite(measurements.sensor[k, i]) and math.isfinite(measurements.marker[k, i])
-            )
+            good = good and math.isfinite(sensor[i]) and math.isfinite(marker[i])
             good = good and math.isfinite(measurements.reference[k, i])
         good = good and math.isfinite(measurements.height[k, 0]) and math.isfinite(measurements.height[k, 1])
         known = False
@@ -476,32 +462,12 @@ class SharedColumns(NamedTuple):
 
 
 class SharedReader:
-    """Decodes messages with readings of many robots each.
-
-    Args:
-        topics: Number of topics.
-        known: Expected contents.
-        decode: Decodes a message.
-        rows_of: Converts a message and arrivals (n,) to readings.
-        nothing: Empty readings.
-        in_map: True if readings must be in the frame `map`.
-    """
+    """Decodes messages with readings of many robots each, which may have to be in the frame `map`."""
 
     def __init__(
-        self,
-        topics: int,
-        known: Known,
-        *,
-        decode: Callable[[bytes], SharedMessage],
-        rows_of: Callable[[SharedMessage, IntArray], Any],
-        nothing: Any,
-        in_map: bool = False,
+        self, topics: int, known: Known, *, shared: SharedTopic, nothing: Any, in_map: bool = False
     ) -> None:
-        self._known = known
-        self._decode = decode
-        self._rows_of = rows_of
-        self._nothing = nothing
-        self._in_map = in_map
+        self._known, self._shared, self._nothing, self._in_map = known, shared, nothing, in_map
         self.frame_ids = [""] * topics
 
     def read(self, batch: MessageBatch) -> SharedColumns:
@@ -511,16 +477,19 @@ class SharedReader:
         dropped: Counter[str] = Counter()
         for k, (topic, arrival_ns, data) in enumerate(batch.messages()):
             try:
-                message = self._decode(data)
+                message = self._shared.decode(data)
             except CdrError:
                 valid[k] = False
                 continue
             stamp_ns[k], self.frame_ids[topic] = message.stamp_ns, message.frame_id
             if fault := self._fault(message):
                 dropped[fault] += message.robot.size
-            else:
-                rows = self._rows_of(message, np.full(message.robot.size, arrival_ns))
-                parts.append(self._sound(rows, dropped))
+            else:  # readings of known robots with valid stamps
+                rows = self._shared.rows_of(message, np.full(message.robot.size, arrival_ns))
+                unknown, unstamped = rows.robot >= self._known.robots, rows.stamp_ns < 0
+                dropped[UNKNOWN_ROBOT] += int(np.sum(unknown))
+                dropped[BAD_STAMP] += int(np.sum(unstamped & ~unknown))
+                parts.append(select(rows, ~(unknown | unstamped)))
         return SharedColumns(stamp_ns, valid, concatenate(parts), +dropped)
 
     def _fault(self, message: SharedMessage) -> str:
@@ -532,19 +501,10 @@ class SharedReader:
             return TOO_MANY
         return FOREIGN_FRAME if self._in_map and message.frame_id != self._known.map_frame else ""
 
-    def _sound(self, rows: Any, dropped: Counter[str]) -> Any:
-        """Select readings of known robots with valid stamps; count the others in `dropped`."""
-        unknown, unstamped = rows.robot >= self._known.robots, rows.stamp_ns < 0
-        dropped[UNKNOWN_ROBOT] += int(np.sum(unknown))
-        dropped[BAD_STAMP] += int(np.sum(unstamped & ~unknown))
-        return select(rows, ~(unknown | unstamped))
-
 
 def _shared_kind(own: InputKind, shared: SharedTopic, nothing: Any) -> InputKind:
     """Kind of a topic with readings of many robots, which replaces their own topics."""
-    reader = partial(
-        SharedReader, decode=shared.decode, rows_of=shared.rows_of, nothing=nothing, in_map=own.in_map
-    )
+    reader = partial(SharedReader, shared=shared, nothing=nothing, in_map=own.in_map)
     return replace(
         own,
         name=f"swarm_{own.name}",

@@ -1,14 +1,12 @@
 """Self-calibration states: systematic errors of odometry, cameras and the map, estimated with the poses.
 
-The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
-and turn. The next three are the yaw offset, the scale error and the range offset of its camera: a range r is
-measured as (1 + scale) r + offset. The last one is the bias of its radio. A landmark with an inexact survey
-and a fixed camera are static bodies: their state is a correction of the survey, with a right-invariant error
-about the identity. That of an anchor is a displacement and the bias of its ranges. Errors that all places
-share correlate these states.
-Parameters with a standard deviation in the description are estimated from the start, as is the path of the
-wheels of robots with radios, others only after a contradiction, with the standard deviations below. Their
-filter columns follow those of all poses, in the order in which they were added.
+Parameters of a robot are errors of its motion, whose effect on the pose grows with distance and turn, the yaw
+offset, scale error and range offset of its camera (a range r is measured as (1 + scale) r + offset), and the
+bias of its radio. The state of a landmark with an inexact survey and of a fixed camera is a correction of the
+survey, with a right-invariant error about the identity; that of an anchor is a displacement and the bias of
+its ranges. Errors that all places share correlate these states. Parameters with a standard deviation in the
+description are estimated from the start, as is the path of the wheels of robots with radios, others only
+after a contradiction, with the sigmas below. Their filter columns follow those of all poses, by addition.
 """
 
 from __future__ import annotations
@@ -34,19 +32,15 @@ RADIO_BIAS = 6  # Error of ranges from or to its radio [m]
 
 DRIVES = 3  # Number of leading parameters that act through the motion
 PARAMETERS = 7
-BLOCKS = -(-PARAMETERS // DRIVES)
-"""Number of blocks of three columns for a robot's parameters: of motion, of the camera, of the radio."""
-_BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
-"""Block of each parameter, and its index in the block."""
+BLOCKS = -(-PARAMETERS // DRIVES)  # Of three columns for a robot's parameters: motion, camera, radio
+_BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)  # Block of each parameter, and its index in it
 
 _CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0, 0.0)
 """Standard deviations of parameters that are exact in the description, after a contradiction."""
-CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
-"""Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
+CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)  # Of a landmark's position [m] and yaw [rad] after a contradiction
 _CONTRADICTED_CAMERA_SIGMA = (0.1, 0.05)  # The same of a fixed camera, which may have been pushed
 
-_MIN_SURVEY_SIGMA = 1e-4
-"""Minimum standard deviation of an estimated landmark [m, rad], so that its covariance is invertible."""
+_MIN_SURVEY_SIGMA = 1e-4  # Minimum of an estimated landmark [m, rad], so that its covariance is invertible
 
 
 class ParameterTable(NamedTuple):
@@ -178,20 +172,15 @@ def _shared(mark: Surveyed, error: MapError) -> FloatArray:
     away = mark.x - error.x, mark.y - error.y
     # of a place, the displacement; of a pose, the common motion of the whole map
     turned = (-away[1], away[0], 0.0) if isinstance(mark, Anchor) else (error.y, -error.x, 1.0)
-    by = np.column_stack([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), turned, (*away, 0.0)])
-    return by * sigma
+    return np.column_stack([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), turned, (*away, 0.0)]) * sigma
 
 
 def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, FloatArray, FloatArray]:
     """What places share of their errors: scale, turn and shift of the similarity that fits these best.
 
-    Args:
-        place: (k, 2) at least two places that differ [m].
-        covariance: (n, n) of their right-invariant errors (3 k), and of any other errors.
-
-    Returns:
-        The shared error, errors (k, 3, 4) of x, y, yaw of the places by one standard deviation of it, and
-        other errors (n - 3 k, 4). The first ones are those by the scale.
+    `place` (k, 2) are at least two places that differ [m], `covariance` (n, n) that of their right-invariant
+    errors (3 k), and of any other errors. Returns the shared error, errors (k, 3, 4) of x, y, yaw of places
+    by one standard deviation of it, the first ones by the scale, and other errors (n - 3 k, 4).
     """
     # scale, turn and shift of the fit, by errors of the places
     count, centre = len(place), place.mean(axis=0)
@@ -199,9 +188,8 @@ def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, F
     moves = np.tile(np.eye(3), (count, 1, 1))  # poses by errors
     moves[:, 0, 2], moves[:, 1, 2] = -place[:, 1], place[:, 0]
     square = float((away**2).sum())
-    by_place = np.array(
-        [away / square, turned / square, *np.broadcast_to(np.eye(2)[:, None] / count, (2, count, 2))]
-    )
+    shifts = np.broadcast_to(np.eye(2)[:, None] / count, (2, count, 2))
+    by_place = np.array([away / square, turned / square, *shifts])
     fit = np.zeros((4, len(covariance)))
     fit[:, : 3 * count] = np.einsum("fki,kij->fkj", by_place, moves[:, :2]).reshape(4, -1)
     # what all errors are expected to be, and the point about which turn and scale leave the least shift

@@ -1,7 +1,4 @@
-"""Error models of odometry, of IMUs, of robots without odometry, of sightings and of absolute fixes.
-
-Motion response: true share of the reported motion, for odometry from commands or with slip.
-"""
+"""Error models of odometry, IMUs, lidars, clocks, robots without odometry, sightings and absolute fixes."""
 
 from __future__ import annotations
 
@@ -47,12 +44,10 @@ class MotionResponse:
 
     def __post_init__(self) -> None:
         for name in ("speeds", "turn_rates"):
-            axis = getattr(self, name)
-            ascends = all(low < high for low, high in itertools.pairwise(axis))
-            if not axis or not all(0.0 <= v <= 1e3 for v in axis) or not ascends:
-                raise MotionResponseError(
-                    f"response.{name} is {list(axis)} but must ascend within [0, 1000]."
-                )
+            at = getattr(self, name)
+            ascends = all(low < high for low, high in itertools.pairwise(at))
+            if not at or not all(0.0 <= v <= 1e3 for v in at) or not ascends:
+                raise MotionResponseError(f"response.{name} is {list(at)} but must ascend within [0, 1000].")
         for name in ("speed_share", "turn_share"):
             table = getattr(self, name)
             if len(table) != len(self.speeds) or any(len(row) != len(self.turn_rates) for row in table):
@@ -85,9 +80,7 @@ class OdometryModel:
     distance_turn_noise: float = number(0.0, "m^2/rad", 0.0, 1.0, "added variance of path per radian turned")
     lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
     turn_noise: float = number(0.0, "rad", 0.0, 10.0, "added variance of turn per radian turned [rad^2/rad]")
-    turn_change_noise: float = number(
-        0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
-    )
+    turn_change_noise: float = number(0.0, "rad s", 0.0, 10.0, "added variance per change of the turn rate")
     distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
     lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
@@ -146,9 +139,7 @@ class LidarModel:
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about its zero before; 3.1416: upside down")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "beams are measured this much after their stamps")
     min_range: float = number(0.0, "m", 0.0, 10.0, "nearer ranges are dropped, as those below range_min")
-    max_range: float = number(
-        12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
-    )
+    max_range: float = number(12.0, "m", 0.2, 50.0, "greatest range, up to which space is free", above=True)
     map_sigma: float = number(0.02, "m", 0.0, 1.0, "error of the map's walls, added to that of its cells")
     robot_radius: float = number(0.0, "m", 0.0, 5.0, "of bodies of other robots that it sees; 0: sees none")
 
@@ -200,9 +191,7 @@ class SensorModel:
     forward_sigma: float = positive(0.02, "m", 10.0, "noise along the optical axis, sightings with heading")
     left_sigma: float = positive(0.01, "m", 10.0, "noise across the optical axis, sightings with heading")
     heading_sigma: float = positive(0.1, "rad", 10.0, "noise of the marker's heading")
-    residual_position_sigma: float = number(
-        0.0, "m", 0.0, 10.0, "additional error forward and left, such as of calibration"
-    )
+    residual_position_sigma: float = number(0.0, "m", 0.0, 10.0, "additional error forward and left")
     residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
     range_sigma: float = positive(0.15, "m", 10.0, "noise of range, sightings without heading")
     range_sigma_per_m: float = number(0.0, "1", 0.0, 10.0, "growth of range noise with distance [m per m]")
@@ -227,9 +216,7 @@ class SensorModel:
 class FixModel:
     """Error model of a robot's absolute fixes, in addition to or in place of the covariance of each."""
 
-    systematic_share: float = number(
-        0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"
-    )
+    systematic_share: float = number(0.0, "1", 0.0, 1.0, "variance shared by earlier fixes; 1: of a mapper")
     position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
     heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
     gate_probability: float = gate("fixes")

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -25,9 +25,6 @@ from swarm_loc_estimator.common.codec import EntrySpec, Tree, TreeChecks, entry,
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, gate, number, number_specs, positive
 from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 _CELLS = 128  # Number of cubics per piece; the error for the curves of the Droplet is 2e-6
 _TABLE_CELLS = 720  # Number of cubics of a tabulated curve, which has no kinks: half a degree each
 _JOINT = 0.01  # Maximum jump at a joint, relative to the curve's maximum; rounded printed joints have 1e-4
@@ -37,7 +34,7 @@ class IrPlatformError(ValueError):
     """An invalid platform; the message is one sentence with key and value."""
 
 
-def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
+def check_numbers(holder: Any, prefix: str = "") -> None:
     """Raise IrPlatformError if a number of a dataclass is not in its declared range."""
     for name, spec in number_specs(type(holder)).items():
         value = getattr(holder, name)
@@ -167,9 +164,6 @@ class Amplitude:
 
     Eq. (21) of the Droplet paper has a pole at 3 cm and is invalid at shorter distances. Below `nearest` the
     curve is extrapolated along its tangent, which keeps it finite and monotonic.
-
-    Raises:
-        IrPlatformError: The pole is not nearer than `nearest`.
     """
 
     scale: float = positive(1.4, "count m^exponent", 1e9, "brightness at a distance of 1 m")
@@ -186,16 +180,13 @@ class Amplitude:
 
 
 def _powers(terms: tuple[tuple[float, float], ...], size: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Values and slopes of a sum of powers."""
     with np.errstate(divide="ignore", invalid="ignore"):
         value = sum((c * size**e for c, e in terms), np.zeros_like(size))
         slope = sum((c * e * size ** (e - 1.0) for c, e in terms if e != 0.0), np.zeros_like(size))
     return value, slope
 
 
-_BACKWARDS = np.array(
-    [[1.0, 0.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [1.0, -2.0, 1.0, 0.0], [1.0, -3.0, 3.0, -1.0]]
-)
+_BACKWARDS = np.array([[1.0, 0, 0, 0], [1.0, -1, 0, 0], [1.0, -2, 1, 0], [1.0, -3, 3, -1]])
 """Right factor that converts coefficients of powers of t into those of powers of 1 - t."""
 
 
@@ -217,8 +208,7 @@ def _check(table: CurveTable) -> None:
         raise IrPlatformError("curve is zero everywhere.")
 
 
-POWERS = ("far", "near")
-"""Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; the second is optional."""
+POWERS = ("far", "near")  # Of emitters, in the order of BrightnessMatrix's POWER_*; the second is optional
 MAX_ELEMENTS = 32
 GAIN_LISTS = ("sensor", "emitter")
 GAIN_RANGE = (0.05, 20.0)
@@ -377,31 +367,22 @@ class PairGains(NamedTuple):
     def of(cls, receivers: list[IrGains], transmitters: list[IrGains]) -> PairGains:
         """Gains of pairs of a receiver and a transmitter."""
         pairs = list(zip(receivers, transmitters, strict=True))
-        return cls(
-            _without(np.array([r.sensor for r, _ in pairs]), [r.dead_sensors for r, _ in pairs]),
-            _without(np.array([t.emitter for _, t in pairs]), [t.dead_emitters for _, t in pairs]),
-            np.array([(r.sigma, r.common_sigma, t.sigma, t.common_sigma) for r, t in pairs]),
-        )
-
-
-def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
-    """Factors (k, n) with NaN for dead elements."""
-    for row, elements in zip(factors, dead, strict=True):
-        row[list(elements)] = np.nan
-    return factors
+        sensor, emitter = np.array([r.sensor for r, _ in pairs]), np.array([t.emitter for _, t in pairs])
+        for k, (receiver, transmitter) in enumerate(pairs):
+            sensor[k, list(receiver.dead_sensors)] = np.nan
+            emitter[k, list(transmitter.dead_emitters)] = np.nan
+        sigmas = [(r.sigma, r.common_sigma, t.sigma, t.common_sigma) for r, t in pairs]
+        return cls(sensor, emitter, np.array(sigmas))
 
 
 def _elements(doc: str) -> EntrySpec:
-    """Numbers of elements."""
-
     def read(checks: TreeChecks, value: Tree, key: str) -> tuple[int, ...]:
         numbers = checks.list_of_numbers(value, key)
         if any(number != int(number) or number < 0 for number in numbers):
             raise checks.error(key, value, "must be a list of numbers of elements, from 0 on")
         return tuple(int(number) for number in numbers)
 
-    items = {"type": "integer", "minimum": 0}
-    return EntrySpec(read, {"type": "array", "items": items, "description": doc})
+    return EntrySpec(read, {"type": "array", "items": {"type": "integer", "minimum": 0}, "description": doc})
 
 
 def _read_gains(checks: TreeChecks, tree: Tree, key: str) -> IrGains | None:
@@ -461,8 +442,7 @@ class IrPlatformFileError(UserError):
 def load_ir_platform(name: str) -> IrPlatform:
     """Read and check a packaged platform, such as "droplet", or that of a file, whose path ends in .yaml.
 
-    Raises:
-        IrPlatformFileError: One sentence with file, key, value and what is allowed.
+    Raises IrPlatformFileError with file, key, value and what is allowed.
     """
     path = Path(name)
     if not name.endswith((".yaml", ".yml")):
@@ -485,10 +465,7 @@ def load_ir_platform(name: str) -> IrPlatform:
 
 
 def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
-    """Write a board that `load_ir_platform` reads back equal, with lines of comment at its top.
-
-    An existing file is replaced, a missing folder created.
-    """
+    """Write a board, which `load_ir_platform` reads back equal, with lines of comment at its top."""
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
     tree: dict[str, Tree] = {"fileversion": FILE_VERSION, "angles": list(platform.angles)}
     for name in GAIN_LISTS:

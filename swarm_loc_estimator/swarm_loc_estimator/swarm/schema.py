@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from typing import Any
 
 from swarm_loc_estimator.common.codec import Schema, entry_specs, properties
 from swarm_loc_estimator.common.parameters import parameter_specs
@@ -21,10 +21,7 @@ def schema_text() -> str:
 
 
 def swarm_schema() -> Schema:
-    """The schema, of draft 7: what `load_swarm` accepts, but for rules on several entries at once.
-
-    Those are that marker ids are unique, that types and faces exist, and the sizes of tables.
-    """
+    """The schema, of draft 7: what `load_swarm` accepts, but for rules on several entries at once."""
     # a robot
     of_robot = {name: {"$ref": f"#/definitions/{name}"} for name in file.LAYER}
     marker_id = {"type": "integer", "minimum": 0, "maximum": file.MAX_ID, "description": "marker id"}
@@ -41,9 +38,28 @@ def swarm_schema() -> Schema:
     camera = _section("camera with a fixed pose", _of_class(FixedCamera), required=("x", "y", "z"))
     anchor = _section("radio at a fixed place", _of_class(Anchor), required=("address", *file.PLACED))
     landmark["type"] = camera["type"] = anchor["type"] = "object"
-    # the whole file
+    # a localizer, whose values are checked when they are read, and the whole file
+    types = {str: "string", bool: "boolean", float: "number", tuple: "array"}
+    localizer = {
+        one.name: {"type": types[type(one.default)], "description": one.doc}
+        for one in parameter_specs(Localizer)
+    }
     names = {"maxLength": file.MAX_NAME}
     free_names = {**names, "not": {"enum": sorted(file.RESERVED_NAMES)}}
+    bounds: Schema = {"type": "object", "minProperties": 1, "maxProperties": file.MAX_ROBOTS}
+    robots = {_PATTERN: _section("a robot", robot)}
+    # what defaults, types and robots may say alike
+    definitions: Schema = {}
+    for name, cls in file.MODELS.items():
+        first = (cls.__doc__ or "").partition("\n")[0].rstrip(".")
+        none = "; null: none" if name in ("odometry", "camera") else ""
+        definitions[name] = _section(f"{first}{none}", _of_class(cls))
+    response, faces = _of_class(MotionResponse), {_PATTERN: _section("a marker", _of_class(Face))}
+    definitions |= {
+        "response": _section("ratios of true to reported motion", response, required=response),
+        "faces": _section("markers on the body", named=faces, propertyNames=names),
+        **{name: _section(said, _of_class(file.SECTIONS[name], file.OWN)) for name, said in _SAID.items()},
+    }
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "Description of a robot swarm",
@@ -56,65 +72,31 @@ def swarm_schema() -> Schema:
                 "what robots have where neither they nor their types say anything else",
                 {**of_robot, "landmark": shared},
             ),
-            "types": {
-                **_section("types of robots", named={_PATTERN: _section("a type", of_robot)}),
-                "propertyNames": names,
-            },
-            "robots": {
-                **_section("the robots", named={_PATTERN: _section("a robot", robot)}),
-                "type": "object",
-                "minProperties": 1,
-                "maxProperties": file.MAX_ROBOTS,
-                "propertyNames": free_names,
-            },
+            "types": _section(
+                "types of robots", named={_PATTERN: _section("a type", of_robot)}, propertyNames=names
+            ),
+            "robots": _section("the robots", named=robots, **bounds, propertyNames=free_names),
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
-            "cameras": {**_section("fixed cameras", named={_PATTERN: camera}), "propertyNames": free_names},
+            "cameras": _section("fixed cameras", named={_PATTERN: camera}, propertyNames=free_names),
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
             "map_error": _section("error that all places with a sigma share", _of_class(MapError)),
             "range_topic": {"type": ["string", "null"], "description": "topic of the ranges of two radios"},
             "topics": {"type": ["object", "null"], "additionalProperties": {"type": "string"}},
-            "localizer": _section("motion capture or another localizer", _localizer()),
+            "localizer": _section("motion capture or another localizer", localizer),
             "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },
-        "definitions": _definitions(),
+        "definitions": definitions,
     }
-
-
-def _definitions() -> Schema:
-    """What defaults, types and robots may say alike."""
-    found = {}
-    for name, cls in file.MODELS.items():
-        first = (cls.__doc__ or "").partition("\n")[0].rstrip(".")
-        none = "; null: none" if name in ("odometry", "camera") else ""
-        found[name] = _section(f"{first}{none}", _of_class(cls))
-    response, face = _of_class(MotionResponse), _section("a marker", _of_class(Face))
-    faces = _section("markers on the body", named={_PATTERN: face})
-    return {
-        **found,
-        "response": _section("ratios of true to reported motion", response, required=response),
-        "faces": {**faces, "propertyNames": {"maxLength": file.MAX_NAME}},
-        **{name: _section(said, _of_class(file.SECTIONS[name], file.OWN)) for name, said in _SAID.items()},
-    }
-
-
-def _localizer() -> Schema:
-    """The keys of a localizer, which are checked when they are read."""
-    types = {str: "string", bool: "boolean", float: "number", tuple: "array"}
-    specs = parameter_specs(Localizer)
-    return {one.name: {"type": types[type(one.default)], "description": one.doc} for one in specs}
 
 
 def _section(
-    said: str, known: Schema | None = None, *, named: Schema | None = None, required: Iterable[str] = ()
+    said: str, known: Schema | None = None, *, named: Schema | None = None, required: Any = (), **others: Any
 ) -> Schema:
-    """A mapping, or null: of known keys, or of names that match a pattern."""
+    """A mapping, or null: of known keys, or of names that match a pattern; `others` are further entries."""
     section: Schema = {"description": said, "type": ["object", "null"], "additionalProperties": False}
-    return (
-        section
-        | ({"properties": known} if known else {})
-        | ({"patternProperties": named} if named else {})
-        | ({"required": list(required)} if required else {})
-    )
+    section |= {"properties": known} if known else {}
+    section |= {"patternProperties": named} if named else {}
+    return section | ({"required": list(required)} if required else {}) | others
 
 
 def _of_class(cls: type, without: tuple[str, ...] = ()) -> Schema:

@@ -12,17 +12,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, matching, switch
 from swarm_loc_estimator.common.parameters import choice, estimated, flag, gate, number, positive, text, texts
-from swarm_loc_estimator.swarm.error_models import (
-    TURN,
-    ClockModel,
-    FixModel,
-    ImuModel,
-    LidarModel,
-    MotionResponse,
-    OdometryModel,
-    RandomWalk,
-    SensorModel,
-)
+from swarm_loc_estimator.swarm import error_models as models
+from swarm_loc_estimator.swarm.error_models import TURN
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.ir_board import RobotIr
@@ -32,7 +23,7 @@ _WORD = r"[A-Za-z0-9_]{0,64}"
 _SAID = {"pattern": f"^{_WORD}$", "description": "in range_topic, the address by default"}
 _NAME = matching(_WORD, "up to 64 letters, digits and underscores", _SAID)
 _SENSOR = EntrySpec(
-    lambda checks, tree, key: SensorModel(**checks.values(tree, key, entry_specs(SensorModel))),
+    lambda checks, tree, key: models.SensorModel(**checks.values(tree, key, entry_specs(models.SensorModel))),
     {"$ref": "#/definitions/sensor"},
 )
 
@@ -70,7 +61,7 @@ class UwbDevice(Radio):
     gate_probability: float = gate("ranges", 0.999)
 
 
-class Placed:
+class StaticBody:
     """A static body, whose place may be estimated."""
 
     @property
@@ -80,7 +71,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Anchor(Radio, Placed):
+class Anchor(Radio, StaticBody):
     """Radio at a fixed place in `map`."""
 
     x: float = number(0.0, "m", -1e8, 1e8, "in map")
@@ -120,31 +111,24 @@ class Face:
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")  #: [m], forward
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")  #: [m], left
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")  #: [m], up
-    #: Direction of the outward normal [rad]; None if the marker shows no heading
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
-    #: Side of the marker, black border included [m]
     size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
-    #: Standard deviation of x and y, each [m]
     position_sigma: float = number(0.0, "m", 0.0, 10.0, "standard deviation of x and y, added to sightings")
     #: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right
     lies: bool = field(default=False, metadata=entry(switch("lies flat and looks up")))
 
 
 @dataclass(frozen=True)
-class Landmark(Placed):
+class Landmark(StaticBody):
     """A static marker in `map`."""
 
     id: int  #: Marker id, unique in the swarm
     x: float = number(0.0, "m", -1e8, 1e8, "in map")  #: [m]
     y: float = number(0.0, "m", -1e8, 1e8, "in map")  #: [m]
     z: float = number(0.0, "m", -1e4, 1e4, "in map")  #: [m]
-    #: Direction of the outward normal [rad]; None if the marker shows no heading
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
-    #: Side of the marker, black border included [m]
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
-    #: Standard deviation of x and y, each [m]
     position_sigma: float = estimated(0.0, "m", 100.0, "x and y")
-    #: Standard deviation of yaw [rad]
     yaw_sigma: float = estimated(0.0, "rad", 10.0, "yaw")
 
 
@@ -163,26 +147,26 @@ class Robot:
 
     name: str  #: Namespace of its topics and prefix of its frames
     type: str = ""  #: Name of its type; "" if it has none
-    odometry: OdometryModel = OdometryModel()  #: Error model of its odometry
-    imu: ImuModel = ImuModel()  #: Error model of its IMU
-    lidar: LidarModel = LidarModel()  #: Its lidar, for mapping and for localization in a map
-    response: MotionResponse | None = None  #: True share of the reported motion; None: all of it
+    odometry: models.OdometryModel = models.OdometryModel()  #: Error model of its odometry
+    imu: models.ImuModel = models.ImuModel()  #: Error model of its IMU
+    lidar: models.LidarModel = models.LidarModel()  #: Its lidar, for mapping and for localization in a map
+    response: models.MotionResponse | None = None  #: True share of the reported motion; None: all of it
     camera: CameraMount | None = CameraMount()  #: Pose of its camera; None if it has none
-    sensor: SensorModel = SensorModel()  #: Error model of its sightings
+    sensor: models.SensorModel = models.SensorModel()  #: Error model of its sightings
     faces: tuple[Face, ...] = ()  #: Markers on its body
     start: Pose2 | None = None  #: Start pose in `map`; None: unknown, to be initialized by sightings or fixes
     start_sigma: StartSigma = StartSigma()  #: Standard deviations of the start pose
     stands: bool = False  #: True if it has no odometry; it moves only by `random_walk`
-    random_walk: RandomWalk = RandomWalk()  #: Random walk without odometry
-    fix: FixModel = FixModel()  #: Error model of its absolute fixes
-    clock: ClockModel = ClockModel()  #: Its clock
+    random_walk: models.RandomWalk = models.RandomWalk()  #: Random walk without odometry
+    fix: models.FixModel = models.FixModel()  #: Error model of its absolute fixes
+    clock: models.ClockModel = models.ClockModel()  #: Its clock
     ir: RobotIr | None = None  #: Infrared board; None if it has none
     uwb: UwbDevice | None = None  #: UWB radio; None if it has none
     #: Numbers that its file says, such as "lidar.yaw"; others may come from transforms
     said: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
 
     @property
-    def turn_sensor(self) -> OdometryModel | ImuModel:
+    def turn_sensor(self) -> models.OdometryModel | models.ImuModel:
         """The error model with the scale and bias of its turns that are estimated."""
         return self.imu if self.imu.is_used else self.odometry
 
@@ -194,7 +178,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class FixedCamera(Placed):
+class FixedCamera(StaticBody):
     """A camera with a fixed pose in `map`, such as at the ceiling; its angles are those of `CameraMount`."""
 
     name: str
@@ -206,7 +190,7 @@ class FixedCamera(Placed):
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
     position_sigma: float = positive(0.001, "m", 10.0, "standard deviation of x and y, always estimated")
     yaw_sigma: float = positive(0.002, "rad", 1.0, "standard deviation of yaw, always estimated")
-    sensor: SensorModel = field(default=SensorModel(), metadata=entry(_SENSOR))
+    sensor: models.SensorModel = field(default=models.SensorModel(), metadata=entry(_SENSOR))
 
 
 Surveyed = Landmark | Anchor | FixedCamera  # A static body whose place may be estimated
@@ -265,8 +249,7 @@ class SwarmError(ValueError):
     """An inconsistent swarm."""
 
 
-MAP_BY_TOPIC: Final = "topic"
-"""`Swarm.map` of a swarm whose map comes on the topic `map`."""
+MAP_BY_TOPIC: Final = "topic"  # `Swarm.map` of a swarm whose map comes on the topic `map`
 
 
 @dataclass(frozen=True)

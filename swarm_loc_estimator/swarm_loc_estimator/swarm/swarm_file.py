@@ -17,22 +17,11 @@ from typing import Any
 from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks, entry_specs, nearest, to_tree
 from swarm_loc_estimator.common.parameters import ParameterError, UserError, number_specs, parameter_specs
 from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
+from swarm_loc_estimator.swarm import swarm as parts
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, IrPlatformFileError, RobotIr, load_ir_platform
-from swarm_loc_estimator.swarm.swarm import (
-    MAP_BY_TOPIC,
-    Anchor,
-    CameraMount,
-    Face,
-    FixedCamera,
-    Landmark,
-    Localizer,
-    MapError,
-    Robot,
-    Swarm,
-    UwbDevice,
-)
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 
 FILE_VERSION = 1
 SCHEMA_FILE = "swarm.schema.json"  # Name of the schema next to a description
@@ -50,11 +39,12 @@ LAYER = (
 )
 _ROBOT = ("type", *LAYER, "ids", "start")
 MODELS: dict[str, type] = {name: type(getattr(Robot, name)) for name in _MODELS}
-SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": UwbDevice}
+SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": parts.UwbDevice}
 MAY_BE_NONE = ("odometry", "camera", "ir", "uwb")
 OWN = ("id", "address", "name")  # Entries of sections that only a robot has
 PLACED = ("x", "y")  # Entries that landmarks and anchors must have
-START = {name: number_specs(Landmark)[name] for name in PLACED} | {"theta": number_specs(CameraMount)["yaw"]}
+START = {name: number_specs(Landmark)[name] for name in PLACED}
+START["theta"] = number_specs(parts.CameraMount)["yaw"]
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell where no description does
 MAX_ID = 2**32 - 1
@@ -67,11 +57,9 @@ _RESERVED = (
     *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),
     *("player", "rosout", "swarm", "tf", "tf_static", "visitation", "watch"),
 )
-RESERVED_NAMES = frozenset(_RESERVED)
-"""Names of topics, nodes and frames that a robot's namespace must not collide with."""
+RESERVED_NAMES = frozenset(_RESERVED)  # Of topics, nodes and frames; no robot may have them
 MAX_ROBOTS = 5000  # Maximum number of robots; larger swarms have not been tested
-MAX_PARAMETERS = 10_000
-"""Maximum number of states but the poses; the dense filter's covariance then has 800 MB per checkpoint."""
+MAX_PARAMETERS = 10_000  # States but the poses; the dense filter's covariance then has 800 MB per checkpoint
 
 
 class SwarmFileError(UserError):
@@ -93,8 +81,7 @@ def parse_swarm(tree: Tree, path: Path) -> Swarm:
     return _Loader(path, SwarmFileError).swarm(tree)
 
 
-Layer = dict[str, Any]
-"""What one of defaults, type and robot says: entries of a section, faces by name; None: null in the file."""
+Layer = dict[str, Any]  # Entries of a section or type, faces by name; None: null in the file
 
 
 class _Loader(TreeChecks):
@@ -106,15 +93,12 @@ class _Loader(TreeChecks):
         self._platforms: dict[str, IrPlatform] = {}
 
     def swarm(self, tree: Tree) -> Swarm:
-        """Parse the whole file."""
         sections = self.mapping(tree, WHOLE_FILE, _SECTIONS)
         self.version(sections.get("fileversion"), FILE_VERSION)
         # what robots have in common, then the robots
         defaults = self._layer(sections.get("defaults", {}), "defaults", (*LAYER, "landmark"))
-        types = {
-            name: self._layer(tree, f"types.{name}", LAYER)
-            for name, tree in self._named(sections.get("types", {}), "types")
-        }
+        kinds = self._named(sections.get("types", {}), "types")
+        types = {name: self._layer(tree, f"types.{name}", LAYER) for name, tree in kinds}
         named = self._named(sections.get("robots", {}), "robots")
         if not named:
             raise self.said("robots is empty but must name at least one robot")
@@ -130,21 +114,21 @@ class _Loader(TreeChecks):
             for number, place in places.items()
             for key in [f"landmarks.{number}"]
         )
-        specs = entry_specs(FixedCamera)
+        specs = entry_specs(parts.FixedCamera)
         cameras = tuple(
-            FixedCamera(name, **self.values(tree, f"cameras.{name}", specs, ("x", "y", "z")))
+            parts.FixedCamera(name, **self.values(tree, f"cameras.{name}", specs, ("x", "y", "z")))
             for name, tree in self._named(sections.get("cameras", {}), "cameras")
         )
-        specs, radios = entry_specs(Anchor), sections.get("anchors")
+        specs, radios = entry_specs(parts.Anchor), sections.get("anchors")
         anchors = tuple(
-            Anchor(**self.values(tree, f"anchors[{k}]", specs, (*PLACED, "address")))
+            parts.Anchor(**self.values(tree, f"anchors[{k}]", specs, (*PLACED, "address")))
             for k, tree in enumerate(self.items([] if radios is None else radios, "anchors"))
         )
-        shared = self.values(sections.get("map_error"), "map_error", entry_specs(MapError))
+        shared = self.values(sections.get("map_error"), "map_error", entry_specs(parts.MapError))
         name = sections.get("map")
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here, or topic")
-        file = name if name in (None, MAP_BY_TOPIC) else (self._folder / name).resolve()
+        file = name if name in (None, parts.MAP_BY_TOPIC) else (self._folder / name).resolve()
         ranges = sections.get("range_topic")
         is_pattern = isinstance(ranges, str) and RANGE_TOPIC.fullmatch(ranges)
         if ranges is not None and not (is_pattern and ranges.count("{from}") == ranges.count("{to}") == 1):
@@ -161,7 +145,7 @@ class _Loader(TreeChecks):
             range_topic=(ranges or "").lstrip("/"),
             topics=self._topics(sections.get("topics"), names, len(robots)),
             localizer=self._localizer(sections.get("localizer")),
-            map_error=MapError(**shared),
+            map_error=parts.MapError(**shared),
         )
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
         if states > MAX_PARAMETERS:
@@ -170,7 +154,6 @@ class _Loader(TreeChecks):
         return swarm
 
     def _robot(self, name: str, tree: Tree, defaults: Layer, types: Mapping[str, Layer]) -> Robot:
-        """Parse one robot from its three layers."""
         key = f"robots.{name}"
         mapping = self.mapping(tree, key, _ROBOT)
         type_name = mapping.get("type", "")
@@ -189,7 +172,7 @@ class _Loader(TreeChecks):
             start = tuple(float(pose[axis]) for axis in START)
         uwb = sections["uwb"]
         if uwb:
-            self.require(uwb, f"{key}.uwb", {"address": entry_specs(UwbDevice)["address"]})
+            self.require(uwb, f"{key}.uwb", {"address": entry_specs(parts.UwbDevice)["address"]})
         return Robot(
             name=name,
             type=type_name or "",
@@ -198,7 +181,7 @@ class _Loader(TreeChecks):
             start=start,
             stands=models["odometry"] is None,
             ir=self._board(sections["ir"], f"{key}.ir"),
-            uwb=UwbDevice(**uwb) if uwb else None,
+            uwb=parts.UwbDevice(**uwb) if uwb else None,
             said=frozenset(f"{name}.{key}" for name, values in sections.items() for key in values or ()),
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
@@ -225,13 +208,12 @@ class _Loader(TreeChecks):
             layer["response"] = self.made(f"{key}.", MotionResponse, **values) if values else None
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         layer["faces"] = {
-            name: None if face is None else self.values(face, f"{key}.faces.{name}", entry_specs(Face))
+            name: None if face is None else self.values(face, f"{key}.faces.{name}", entry_specs(parts.Face))
             for name, face in faces
         }
         return layer
 
     def _topics(self, tree: Tree, sources: Collection[str], robots: int) -> dict[str, str]:
-        """Parse the topics in place of expected ones."""
         topics: dict[str, str] = {}
         for own, topic in self.mapping(tree, "topics").items():
             key, (source, _, name) = f"topics.{own}", str(own).partition("/")
@@ -244,23 +226,22 @@ class _Loader(TreeChecks):
             topics[own] = topic
         return topics
 
-    def _localizer(self, tree: Tree) -> Localizer | None:
+    def _localizer(self, tree: Tree) -> parts.Localizer | None:
         """Parse the localizer, whose keys are the parameters of `localizer_bridge`."""
-        specs = {spec.name: spec for spec in parameter_specs(Localizer)}
+        specs = {spec.name: spec for spec in parameter_specs(parts.Localizer)}
         given = self.mapping(tree, "localizer", specs)
         try:
             values: Layer = {name: specs[name].checked(value) for name, value in given.items()}
         except ParameterError as error:
             said = str(error).removeprefix("parameter ").removesuffix(".")
             raise self.said(f"localizer.{said}") from error
-        return Localizer(**values) if tree is not None else None
+        return parts.Localizer(**values) if tree is not None else None
 
     def _board(self, values: Layer | None, key: str) -> RobotIr | None:
         """The infrared board of a robot from the merged values of its layers."""
         if not values:
             return None
-        specs = entry_specs(RobotIr)
-        self.require(values, key, {name: specs[name] for name in ("platform", "id")})
+        self.require(values, key, {name: entry_specs(RobotIr)[name] for name in ("platform", "id")})
         source = values["platform"]
         platform, gains = self._platforms[source], values.get("gains")
         if gains is not None and len(gains.sensor) != platform.n:
@@ -274,15 +255,14 @@ class _Loader(TreeChecks):
 
     def _platform(self, name: str, key: str) -> str:
         """The source of a platform; also loads the platform."""
-        is_path = name.endswith((".yaml", ".yml"))
-        source = str((self._folder / name).resolve()) if is_path else name
+        source = str((self._folder / name).resolve()) if name.endswith((".yaml", ".yml")) else name
         try:
             self._platforms[source] = self._platforms.get(source) or load_ir_platform(source)
         except IrPlatformFileError as error:
             raise self.said(f"{key}: {str(error).removesuffix('.')}") from error
         return source
 
-    def _faces(self, key: str, layers: Iterable[Layer], ids_tree: Tree) -> tuple[Face, ...]:
+    def _faces(self, key: str, layers: Iterable[Layer], ids_tree: Tree) -> tuple[parts.Face, ...]:
         """Parse the robot's markers: poses from the layers, marker ids from the robot."""
         places: dict[str, Layer] = {}
         for layer in layers:
@@ -297,7 +277,7 @@ class _Loader(TreeChecks):
             advice = f"give one or set faces.{missing[0]} to null"
             raise self.said(f"{key}.ids has no id for face '{missing[0]}'; {advice}")
         numbers = {name: self._marker_id(ids[name], f"{key}.ids.{name}") for name in places}
-        return tuple(Face(name, numbers[name], **values) for name, values in places.items())
+        return tuple(parts.Face(name, numbers[name], **values) for name, values in places.items())
 
     def _marker_id(self, value: Tree, key: str) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
@@ -347,8 +327,8 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     parse_swarm(tree, path)
     schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
     # one comment per group of numbers, with the unit of each
-    groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
-    groups |= {"cameras": FixedCamera, "anchors": Anchor, "map_error": MapError}
+    groups = {**MODELS, "uwb": parts.UwbDevice, "faces": parts.Face, "landmarks": Landmark}
+    groups |= {"cameras": parts.FixedCamera, "anchors": parts.Anchor, "map_error": parts.MapError}
     units = ["Units:"]
     for name, cls in groups.items():
         said = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
@@ -366,7 +346,7 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
     landmarks = {mark.id: to_tree(mark, PLACED) for mark in swarm.landmarks}
     shared = _common([*landmarks.values()])
     defaults = {name: value for name, value in shared.items() if name in LANDMARK_DEFAULTS}
-    usual, localizer = vars(Localizer()), vars(swarm.localizer) if swarm.localizer else {}
+    usual, localizer = vars(parts.Localizer()), vars(swarm.localizer) if swarm.localizer else {}
     tree = {
         "fileversion": FILE_VERSION,
         "defaults": {"landmark": defaults} if defaults else {},
@@ -389,7 +369,6 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
 
 
 def _common(entries: list[Layer]) -> Layer:
-    """The values that all entries have."""
     first = entries[0] if entries else {}
     return {name: value for name, value in first.items() if all(one.get(name) == value for one in entries)}
 
@@ -413,8 +392,8 @@ def _layer(robot: Robot, folder: Path) -> Layer:
     if robot.stands:
         layer["odometry"] = None
     if robot.ir is not None:
-        is_path = Path(robot.ir.source).is_absolute()
-        source = relpath(robot.ir.source, folder.resolve()) if is_path else robot.ir.source
+        source = robot.ir.source
+        source = relpath(source, folder.resolve()) if Path(source).is_absolute() else source
         layer["ir"] = {"platform": source, **layer["ir"]}
     return layer
 
@@ -432,7 +411,6 @@ def _shared(layers: list[Layer]) -> Layer:
 
 
 def _robot(robot: Robot, shared: Layer, folder: Path) -> Layer:
-    """A robot without what its type says."""
     entry: Layer = {"type": robot.type} if robot.type else {}
     for section, value in _layer(robot, folder).items():
         rest = value

@@ -12,16 +12,23 @@ from collections import Counter
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF, is_contradicted
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.assignment import AMBIGUOUS, UNSEEN, Assignment, assign, log_ratios
-from swarm_loc_estimator.identification.chain import ChainModel, Chains, Identity
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Identity, Scale
 from swarm_loc_estimator.identification.memory import Identities, IdentityMemory, Outcome
-from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
+from swarm_loc_estimator.identification.picture import (
+    AMBIGUOUS,
+    UNSEEN,
+    Assignment,
+    Picture,
+    TrackPoint,
+    assign,
+    gathered_between,
+    log_ratios,
+)
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -38,13 +45,7 @@ _HEADING_SIGMA = 0.2  # Maximum standard deviation of the heading of an identifi
 
 
 class PictureFusion:
-    """Identifies robots in aerial images.
-
-    Args:
-        swarm: Robots in the images.
-        settings: Required probability, model of the images, thresholds of lost robots.
-        tracks: Odometry of the robots.
-    """
+    """Identifies robots in aerial images, by their odometry and a model of the images."""
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
@@ -74,41 +75,26 @@ class PictureFusion:
         newest = _memory(state).newest
         before_ns = newest.stamp_ns if newest is not None else stamp_ns
         unseen &= state.last_fix_ns[robots] <= before_ns  # no other fix since the previous image
-        for robot in robots[unseen & in_view].tolist():
-            self._miss_robot(state, robot, stamp_ns)
+        score, known = state.sources.score, state.sources.confirmations >= CONFIRMED
+        for robot in robots[unseen & in_view].tolist():  # it is not where it is estimated
+            score[robot] += self._miss
+            if not known[robot] or score[robot] >= self._settings.max_fault_score:
+                state.deinitialize(robot, LossReason.NOT_IN_IMAGE, stamp_ns)
         strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
         for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
             # the robot may have left the view, or be one of the unassigned detections
-            score = state.sources.score
             score[robot] += min(self._miss, _MAX_FAULT_SCORE - score[robot])
         place = np.full(state.tracked.size, UNSEEN)
         probability = np.zeros(state.tracked.size)
         place[robots], probability[robots] = found.place, found.probability
         known = found.robot >= 0
         robot = np.where(known, robots[np.where(known, found.robot, 0)] if robots.size else 0, found.robot)
-        _memory(state).newest = Identities(
-            stamp_ns, np.where(place >= 0, _numbers(image, place), -1), probability
-        )
+        number = np.where(place >= 0, image.reading[np.maximum(place, 0)], -1)  # in the message
+        _memory(state).newest = Identities(stamp_ns, number, probability)
         return Assignment(place, robot, probability)
 
-    def _miss_robot(self, state: SwarmState, robot: int, stamp_ns: int) -> None:
-        """Increase the fault score of a robot that was not detected at its estimated position."""
-        unconfirmed = state.sources.confirmations[robot] < CONFIRMED
-        state.sources.score[robot] += self._miss
-        if unconfirmed or state.sources.score[robot] >= self._settings.max_fault_score:
-            state.deinitialize(robot, LossReason.NOT_IN_IMAGE, stamp_ns)
-
     def identify(self, state: SwarmState, image: Measurements, assignment: Assignment) -> bool:
-        """Search an image for robots that are not localized or were not detected at their estimate.
-
-        Args:
-            state: Updated in place.
-            image: (n,) detections, all of one image.
-            assignment: Assignment of the localized robots.
-
-        Returns:
-            Whether any robot was searched.
-        """
+        """Search an image (n,) for robots that are not located or not assigned; return if there are any."""
         images, stamp_ns = _memory(state), int(image.stamp_ns[0])
         looking = self._moves & (~state.tracked | (assignment.place == UNSEEN))
         for robot in [robot for robot in images.chains if not looking[robot]]:
@@ -146,7 +132,11 @@ class PictureFusion:
             return Outcome.NO_ODOMETRY, None
         point, picture = TrackPoint(sample.pose[0], sample.covariance[0]), picture_of(image)
         chains = _memory(state).chains.get(robot)
-        if chains is None or chains.point is None or _has_drifted(chains.point, point):
+        drift = np.zeros(3)  # variances that the track has gathered since the last image
+        if chains is not None and chains.point is not None:
+            drift = np.diag(gathered_between(chains.point, point))
+        has_drifted = max(drift[0], drift[1]) > _MAX_DRIFT_M**2 or drift[2] > _MAX_DRIFT_RAD**2
+        if chains is None or chains.point is None or has_drifted:
             chains = Chains(self._model)
         elif not _has_moved(chains.point, point, picture):
             return Outcome.NOT_MOVED, None
@@ -169,9 +159,8 @@ class PictureFusion:
         track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
         transform = se2.compose(claim.pose, se2.inverse(track.pose[0]))
-        state.initialize(
-            robot, InitialPose(transform, se2.error_covariance(claim.pose, claim.covariance)), at
-        )
+        initial = InitialPose(transform, se2.error_covariance(claim.pose, claim.covariance))
+        state.initialize(robot, initial, at)
         state.last_fix_ns[robot] = stamp_ns
         _memory(state).chains.pop(robot, None)
 
@@ -224,12 +213,6 @@ def as_fixes(image: Measurements, robots: IntArray) -> Measurements:
     return image._replace(model=none + CARTESIAN, target=robots, reading=none)
 
 
-def _numbers(image: Measurements, places: IntArray) -> IntArray:
-    """Indices (k,) in the message of the detections at `places` (k,); arbitrary for negative places."""
-    numbers: IntArray = image.reading[np.maximum(places, 0)]
-    return numbers
-
-
 def _log_density(picture: Picture) -> float:
     """Logarithm of the density of detections in their bounding box [1/m^2]."""
     extent = np.ptp(picture.pose[:, :2], axis=0)
@@ -247,9 +230,3 @@ def _has_moved(before: TrackPoint, now: TrackPoint, picture: Picture) -> bool:
         return False
     variance = 2.0 * float(picture.covariance[picture.has_heading, 2, 2].min()) + gathered[2, 2]
     return bool((now.pose[2] - before.pose[2]) ** 2 > (0.5 * _MOVED) ** 2 * variance)
-
-
-def _has_drifted(before: TrackPoint, now: TrackPoint) -> bool:
-    """Whether the covariance of the track since a point exceeds the maximum drift."""
-    drift: FloatArray = np.diag(gathered_between(before, now))
-    return bool(max(drift[0], drift[1]) > _MAX_DRIFT_M**2 or drift[2] > _MAX_DRIFT_RAD**2)

@@ -17,17 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import composed, wrap
+from swarm_loc_estimator.filter import sources
 from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.filter.models import ANY_HEADING
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
-from swarm_loc_estimator.filter.sources import (
-    CONFIRMED,
-    depends_on_heading,
-    excluded_links,
-    is_contradicted,
-    repeating_robots,
-    widen_suspect_covariance,
-)
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
@@ -75,42 +68,21 @@ class Estimate(NamedTuple):
     map_to_odom: FloatArray  #: (N, 3) transform from `map` to the robot's odom frame; NaN where `poses` are
     status: NDArray[np.uint8]  #: (N,) of `Status`
     fix_age_s: FloatArray  #: (N,) age of the newest accepted landmark sighting or absolute fix [s]; -1: none
-    heading_known: (
-        BoolArray  #: (N,) whether the standard deviation of the heading is below `lost_heading_sigma`
-    )
+    #: (N,) whether the standard deviation of the heading is below `lost_heading_sigma`
+    heading_known: BoolArray
 
 
 def estimate_at(state: SwarmState, tracks: TrackArrays, limits: TrackedLimits, now_ns: int) -> Estimate:
-    """Predict the estimate to an instant.
-
-    Args:
-        state: State at the newest measurements.
-        tracks: Odometry, used for the prediction.
-        limits: Decide which robots are tracked.
-        now_ns: The instant.
-    """
-    estimate = _new_estimate(now_ns, state.tracked.size)
-    _write_all(state.arrays(), tracks, limits, estimate)
-    return estimate
+    """Predict the estimate by odometry from the newest measurements to an instant."""
+    return _estimate(state.arrays(), tracks, limits, now_ns)
 
 
 @cached_njit
-def _new_estimate(now_ns: int, robots: int) -> Estimate:
-    """An estimate without localized robots."""
-    return Estimate(
-        now_ns,
-        np.full((robots, 3), np.nan),
-        np.full((robots, 3, 3), np.nan),
-        np.full((robots, 3), np.nan),
-        np.full(robots, _WAITING, dtype=np.uint8),
-        np.full(robots, -1.0),
-        np.zeros(robots, dtype=np.bool_),
-    )
-
-
-@cached_njit
-def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits, out: Estimate) -> None:
-    """Write the predictions of all tracked robots to an estimate."""
+def _estimate(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits, now_ns: int) -> Estimate:
+    robots = belief.tracked.size
+    pose, covariance = np.full((2, robots, 3), np.nan), np.full((robots, 3, 3), np.nan)
+    status, age_s = np.full(robots, _WAITING, dtype=np.uint8), np.full(robots, -1.0)
+    out = Estimate(now_ns, pose[0], covariance, pose[1], status, age_s, np.zeros(robots, dtype=np.bool_))
     sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
     track, raw = sample.pose[0], sample.raw[0]
     for i in range(belief.tracked.size):
@@ -123,16 +95,26 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         write_predicted(belief, i, to, scratch, t, error)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
-        _pose_covariance(x, y, error, out.covariances[i])
-        widen_suspect_covariance(belief.sources, i, out.covariances[i])
-        _cap_heading(out.covariances[i])
-        out.heading_known[i] = out.covariances[i, 2, 2] <= limits.heading_sigma**2
+        # Covariance of x, y, theta by that of the right-invariant error, of a heading anywhere in a turn at
+        # most.
+        own, shear = out.covariances[i], (-y, x, 0.0)
+        for a in range(3):
+            for b in range(3):
+                own[a, b] = error[a, b] + shear[a] * error[2, b] + error[a, 2] * shear[b]
+                own[a, b] += shear[a] * error[2, 2] * shear[b]
+        sources.widen_suspect_covariance(belief.sources, i, own)
+        scale = np.sqrt(min(1.0, ANY_HEADING / own[2, 2]))
+        for a in range(3):
+            own[a, 2] *= scale
+            own[2, a] *= scale
+        out.heading_known[i] = own[2, 2] <= limits.heading_sigma**2
         drives, silence_s = not tracks.is_stationary[i], sample.silence_s[0]
-        out.status[i] = _status(belief, i, silence_s, limits, out.covariances[i], drives)
+        out.status[i] = _status(belief, i, silence_s, limits, own, drives)
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
         out.map_to_odom[i, 2] = wrap(theta - raw[2])
+    return out
 
 
 @inlined_njit
@@ -147,33 +129,14 @@ def _status(
     """Status of a localized robot with the reported covariance (3, 3); whether it has odometry."""
     if silence_s > limits.timeout_s[robot]:
         return _STALE
-    if belief.sources.confirmations[robot] <= CONFIRMED:
+    if belief.sources.confirmations[robot] <= sources.CONFIRMED:
         return _UNCONFIRMED
-    if is_contradicted(belief, robot):
+    if sources.is_contradicted(belief, robot):
         return _CONTRADICTED
     xx, yy, tt = covariance[0, 0], covariance[1, 1], covariance[2, 2]
     sideways = (covariance[0, 2], covariance[1, 2])
-    turns = tt > limits.heading_sigma**2 and depends_on_heading(xx + yy, sideways, tt, drives)
+    turns = tt > limits.heading_sigma**2 and sources.depends_on_heading(xx + yy, sideways, tt, drives)
     return _UNCERTAIN if turns or max(xx, yy) > limits.position_sigma**2 else _TRACKED
-
-
-@inlined_njit
-def _cap_heading(covariance: FloatArray) -> None:
-    """Limit the variance of the heading in a covariance (3, 3) to that of a heading anywhere in a turn."""
-    scale = np.sqrt(min(1.0, ANY_HEADING / covariance[2, 2]))
-    for i in range(3):
-        covariance[i, 2] *= scale
-        covariance[2, i] *= scale
-
-
-@inlined_njit
-def _pose_covariance(x: float, y: float, error: FloatArray, out: FloatArray) -> None:
-    """Write the covariance (3, 3) of x, y, theta, converted from that of the right-invariant error."""
-    shear = (-y, x, 0.0)
-    for a in range(3):
-        for b in range(3):
-            out[a, b] = error[a, b] + shear[a] * error[2, b] + error[a, 2] * shear[b]
-            out[a, b] += shear[a] * error[2, 2] * shear[b]
 
 
 _MOVES = 3
@@ -186,7 +149,7 @@ _LONG_AGO_NS = np.iinfo(np.int64).min // 2
 LOSS_CAUSES = {
     LossReason.UNCERTAIN: "its position's standard deviation exceeded {0.lost_sigma:g} m (lost_sigma), or"
     " stemmed from a heading beyond {0.lost_heading_sigma:g} rad (lost_heading_sigma)",
-    LossReason.REFUTED: f"a measurement contradicted its pose before {CONFIRMED:g} had confirmed it",
+    LossReason.REFUTED: f"a measurement contradicted its pose before {sources.CONFIRMED:g} had confirmed it",
     LossReason.GATED: "{0.lost_after} measurements in a row were gated",
     LossReason.OFF_FIXES: "several absolute fixes in a row were gated",
     LossReason.KIDNAPPED: "its measurements can only mean that it is elsewhere",
@@ -216,17 +179,12 @@ def last_loss(state: SwarmState, robot: int, settings: Settings) -> LossReport |
     why = int(state.lost_why[robot])
     if not why:
         return None
-    return LossReport(
-        robot, LossReason(why), int(state.lost_ns[robot]), LOSS_CAUSES[LossReason(why)].format(settings)
-    )
+    cause = LOSS_CAUSES[LossReason(why)].format(settings)
+    return LossReport(robot, LossReason(why), int(state.lost_ns[robot]), cause)
 
 
 class ConstantOdometry:
-    """Moves of estimated poses of robots whose odometry has never changed.
-
-    Args:
-        robots: Number of robots.
-    """
+    """Moves of estimated poses of robots whose odometry has never changed."""
 
     def __init__(self, robots: int) -> None:
         self._from = np.full((robots, 2), np.nan)
@@ -291,16 +249,7 @@ def contradictions(
     max_fault_score: float,
     now_ns: int,
 ) -> list[Contradiction]:
-    """All faults detected at an instant.
-
-    Args:
-        swarm: Gives the names.
-        state: Newest state.
-        tracks: Odometry, to detect conflicting sources, resets and constant poses.
-        unmoved: (N,) robots that move although their odometry has never changed.
-        max_fault_score: Fault score from which a source is contradicted.
-        now_ns: The instant.
-    """
+    """All faults detected at an instant; `unmoved` (N,) move although their odometry has never changed."""
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
     names += [f"anchor {anchor.address}" for anchor in swarm.anchors]
     names += [camera.name for camera in swarm.cameras]
@@ -309,11 +258,14 @@ def contradictions(
     names += [f"marker of {one.name}" for one in swarm.robots]
     conflicting = tracks.had_faults(now_ns, 2)
     reset = tracks.had_faults(now_ns, 1) & ~conflicting
-    denied = [is_tracked and is_contradicted(belief, robot) for robot, is_tracked in enumerate(state.tracked)]
+    denied = [
+        is_tracked and sources.is_contradicted(belief, robot)
+        for robot, is_tracked in enumerate(state.tracked)
+    ]
     # Turns of gyroscopes may still turn out uncertain, which would explain what was found since then.
     is_new = state.contradicted_ns > now_ns - tracks.unsettled_ns
     contradicted = np.flatnonzero((state.contradicted_ns > NEVER_NS) & ~is_new).tolist()
-    aside = [(robot, source % len(names)) for robot, source in excluded_links(state.sources, now_ns)]
+    aside = [(robot, source % len(names)) for robot, source in sources.excluded_links(state.sources, now_ns)]
     outside = range(len(names) - 2 * robots - len(swarm.cameras), len(names))  # cameras, fixes and markers
     suspended = np.flatnonzero(state.sources.score[robots:] >= max_fault_score + 1.0) + robots
     found: list[tuple[Contradicted, ArrayLike]] = [
@@ -323,7 +275,7 @@ def contradictions(
         (Contradicted.UNMOVED, unmoved),
         (Contradicted.GYROSCOPE, tracks.contradicts_gyroscope()),
         (Contradicted.POSE, denied),
-        (Contradicted.REPEATED, repeating_robots(state.sources, now_ns)),
+        (Contradicted.REPEATED, sources.repeating_robots(state.sources, now_ns)),
     ]
     return [
         *(

@@ -33,6 +33,7 @@ from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, Guard, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline import local_origin
 from swarm_loc_estimator.timeline.estimate import (
     ConstantOdometry,
     Contradiction,
@@ -45,15 +46,6 @@ from swarm_loc_estimator.timeline.estimate import (
     last_loss,
 )
 from swarm_loc_estimator.timeline.fusion import Fusion
-from swarm_loc_estimator.timeline.local_origin import (
-    PLACING,
-    OriginOfFixes,
-    about,
-    described_origin,
-    is_placed,
-    local_origin,
-    readings_about,
-)
 from swarm_loc_estimator.timeline.map_search import placed_map
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -101,11 +93,11 @@ class Estimator:
         """Begin with a description."""
         self.swarm = swarm
         # Poses are estimated about a local origin, which the first fix tells where no description does.
-        self._origin = described_origin(swarm) if is_placed(swarm) else None
+        self._origin = local_origin.described_origin(swarm) if local_origin.is_placed(swarm) else None
         if self._origin is None and self._drawn is not None:
-            self._origin = local_origin(self._drawn.corner[None])
-        self._seen = OriginOfFixes() if self._origin is None else None
-        swarm = self._local = swarm if self._origin is None else about(swarm, self._origin)
+            self._origin = local_origin.local_origin(self._drawn.corner[None])
+        self._seen = local_origin.OriginOfFixes() if self._origin is None else None
+        swarm = self._local = swarm if self._origin is None else local_origin.about(swarm, self._origin)
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
@@ -161,13 +153,13 @@ class Estimator:
 
     def convert(self, batch: Batch) -> Batch:
         """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
-        if self._seen is not None and any(name in batch.rows for name in PLACING):
+        if self._seen is not None and any(name in batch.rows for name in local_origin.PLACING):
             moved = self._seen.moved(batch.rows, self._origin)
             if moved is not None and self._origin is not None:
                 self.reset()  # it was that of a source whose fixes are far from all others
             self._origin = self._origin if moved is None else moved
         if self._origin is not None and self._origin.any():
-            batch = replace(batch, rows=readings_about(batch.rows, self._origin))
+            batch = replace(batch, rows=local_origin.readings_about(batch.rows, self._origin))
         return self._converter.convert(batch)
 
     def receive(self, inputs: Batch) -> None:
@@ -219,7 +211,7 @@ class Estimator:
         self._use_odometry()
         poses = np.array([pose], dtype=float)
         if self._origin is None:
-            self._origin = local_origin(poses[:, :2])
+            self._origin = local_origin.local_origin(poses[:, :2])
         poses[:, :2] -= self._origin
         fix = about_robots(robot, stamp_ns, poses, np.array([covariance]), CARTESIAN)
         fault = REJECT_REASONS[reject_reasons(fix)[0]] or (
@@ -240,7 +232,7 @@ class Estimator:
             MapFileError: It has no walls, or no free space.
         """
         if self._origin is None:
-            self._origin = local_origin(drawn.corner[None])
+            self._origin = local_origin.local_origin(drawn.corner[None])
         self._seen, self._drawn = None, drawn  # from now on the map tells the origin
         self._fusion.map = placed_map(drawn, self._origin)
         nobody = Command(stamp_ns, CommandKind.NEW_MAP, NOBODY, np.zeros(3), np.eye(3), self._fusion.map)
@@ -287,7 +279,8 @@ class Estimator:
 
     def recent(self) -> Recent:
         """Measurements within the horizon, with verdicts and NIS."""
-        return Recent(self._timeline.measurements, self._timeline.verdicts, self._timeline.nis)
+        buffer = self._timeline.buffer
+        return Recent(buffer.part(0, len(buffer)), buffer.verdicts, buffer.nis)
 
     @property
     def identities(self) -> Identities | None:
@@ -322,7 +315,7 @@ class Estimator:
     def learned(self) -> Swarm:
         """Swarm with the estimated parameters of cameras, odometry and landmarks."""
         found = learned(self._local, self._timeline.state)
-        return found if self._origin is None else about(found, -self._origin)
+        return found if self._origin is None else local_origin.about(found, -self._origin)
 
     @property
     def origin(self) -> str:
@@ -352,7 +345,7 @@ class Estimator:
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
-            needed_ns = min([oldest_ns, *self._timeline.stamp_ns[:1].tolist()])
+            needed_ns = min([oldest_ns, *self._timeline.buffer.stamp_ns[:1].tolist()])
             for accumulator in self._gathering.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)

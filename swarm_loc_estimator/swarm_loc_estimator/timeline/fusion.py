@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.correlated_noise import (
-    at_initialization,
-    note_batch,
-    record_constraint,
-    without_repeats,
-)
+from swarm_loc_estimator.filter import correlated_noise, models, sources, update
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurements import (
     NOBODY,
@@ -26,25 +21,6 @@ from swarm_loc_estimator.filter.measurements import (
     Measurements,
     Verdict,
     select,
-)
-from swarm_loc_estimator.filter.models import (
-    ANONYMOUS,
-    CARTESIAN,
-    COMPILED,
-    MODELS,
-    SCAN,
-    is_compiled,
-    locates_alone,
-)
-from swarm_loc_estimator.filter.sources import (
-    CORRELATION_NS,
-    DOUBTED_SHARE,
-    RELIEF,
-    SUSPECT,
-    WELL_CONFIRMED,
-    LossLimits,
-    bad_share,
-    is_kidnapped,
 )
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import (
@@ -56,21 +32,7 @@ from swarm_loc_estimator.filter.state import (
     correct,
     new_innovations,
 )
-from swarm_loc_estimator.filter.update import (
-    ATTRIBUTE,
-    CONTRADICTED,
-    EVALUATE,
-    FINISHED,
-    IS_LINK,
-    LOST,
-    PREDICT,
-    SETTLE,
-    evaluate_link,
-    fuse,
-    fuse_in_order,
-    related_columns,
-)
-from swarm_loc_estimator.identification.assignment import AMBIGUOUS
+from swarm_loc_estimator.identification.picture import AMBIGUOUS
 from swarm_loc_estimator.initialization.initializer import ConfiguredStarts, Initializer, Keep, LocalFrame
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -94,28 +56,16 @@ _NO: Any = np.False_
 
 
 class Fusion:
-    """Filter steps for one swarm.
-
-    Args:
-        swarm: Robots and landmarks.
-        settings: Fusion period and thresholds.
-        tracks: Odometry of the robots.
-        sweeps: Sweeps of lidars by robot and stamp.
-
-    Attributes:
-        is_sparse: True for a large swarm: only covariances of neighbours are kept.
-        starts: Initializes robots at their configured starts.
-        map: The known map of states from the beginning; None: there is none.
-    """
+    """Filter steps for one swarm, with its odometry and the sweeps of its lidars by robot and stamp."""
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self._tracks = tracks
         self._policy = settings.policy
-        self._limits = LossLimits(
+        self._limits = sources.LossLimits(
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_fault_score
         )
         self._period_ns = round(settings.fusion_period_s * 1e9)
-        self.is_sparse = settings.is_sparse(swarm)
+        self.is_sparse = settings.is_sparse(swarm)  # Whether only covariances of neighbours are kept
         self._is_large = len(swarm.robots) >= self._policy.large_from
         self.starts = ConfiguredStarts(swarm, tracks)
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
@@ -123,6 +73,7 @@ class Fusion:
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._scans = MapScans(swarm, settings, tracks, sweeps)
+        # The known map of states from the beginning; None: there is none
         self._search, self.map = MapSearch(self._scans, swarm), described_map(swarm)
         self._sees_robots = [robot.lidar.sees_robots for robot in swarm.robots]
         self._others = RobotsInScans(swarm, settings, self._scans) if any(self._sees_robots) else None
@@ -150,18 +101,11 @@ class Fusion:
         verdicts: NDArray[np.uint8],
         nis: FloatArray,
     ) -> None:
-        """Fuse measurements into the state, and execute commands at their stamps.
+        """Fuse measurements (m,) into the state, and execute commands at their stamps; all sorted by stamp.
 
         Few measurements are fused sequentially, each at its exact stamp. Many within `fusion_period_s` are
         fused as one batch: each uses the poses at its own stamp, but the process noise at the middle of the
-        period.
-
-        Args:
-            state: Updated in place.
-            measurements: (m,) sorted by stamp.
-            commands: Sorted by stamp.
-            verdicts: (m,) written, of `Verdict`.
-            nis: (m,) normalized innovation squared, written; NaN if not evaluated.
+        period. Verdicts (m,) and normalized innovations squared (m,), NaN if not evaluated, are written.
         """
         nis[:] = np.nan
         begin = 0
@@ -183,10 +127,9 @@ class Fusion:
         """Fuse rows of measurements; scans and images become fixes before."""
         some, verdicts, nis = select(measurements, rows), verdicts[rows], nis[rows]
         for part in _parts(some):
-            fuse = {ANONYMOUS: self._fuse_image, SCAN: self._fuse_scan}.get(
-                int(some.model[part.start]) if some.size else CARTESIAN, self._fuse
-            )
-            fuse(state, select(some, part), verdicts[part], nis[part])
+            model = int(some.model[part.start]) if some.size else models.CARTESIAN
+            way = {models.ANONYMOUS: self._fuse_image, models.SCAN: self._fuse_scan}.get(model, self._fuse)
+            way(state, select(some, part), verdicts[part], nis[part])
 
     def _fuse(
         self, state: SwarmState, measurements: Measurements, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -196,16 +139,13 @@ class Fusion:
             some = select(measurements, part)
             if is_absolute:
                 verdicts[part] = self._note(state, some.row(0), self._local.collect)
-            elif state.filter.is_dense and not self._is_many(some):
+            elif state.filter.is_dense and not (
+                self._period_ns and self._is_large and some.size >= self._policy.batch_from
+            ):
                 self._fuse_in_order(state, some, verdicts[part], nis[part])
             else:
-                for one in without_repeats(some):
+                for one in correlated_noise.without_repeats(some):
                     self._fuse_together(state, select(some, one), verdicts[part][one], nis[part][one])
-
-    def _is_many(self, measurements: Measurements) -> bool:
-        """Whether measurements of a large swarm are fused together."""
-        many = self._is_large and measurements.size >= self._policy.batch_from
-        return bool(self._period_ns) and many
 
     def _fuse_image(
         self, state: SwarmState, image: Measurements, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -227,9 +167,8 @@ class Fusion:
             verdicts[known], nis[known] = outcome, own_nis
             relieve_seen(state, assignment.robot[known][outcome == Verdict.USED])
         # The others may be robots that are not located.
-        unknown = (
-            Verdict.CONSTRAINT if self._pictures.identify(state, image, assignment) else Verdict.UNASSIGNED
-        )
+        are_searched = self._pictures.identify(state, image, assignment)
+        unknown = Verdict.CONSTRAINT if are_searched else Verdict.UNASSIGNED
         unclear = assignment.robot[~known] == AMBIGUOUS
         verdicts[~known] = np.where(unclear, Verdict.AMBIGUOUS, unknown)
 
@@ -274,29 +213,28 @@ class Fusion:
         self, state: SwarmState, measurements: Measurements, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse measurements one by one, each linearized about the newest belief; the filter is dense."""
-        k, stage, tracks, limits = 0, PREDICT, self._tracks.arrays, self._limits
-        work = None if is_compiled(measurements.model).all() else new_innovations(1, *self._sides)
+        k, stage, tracks, limits = 0, update.PREDICT, self._tracks.arrays, self._limits
         while True:
             belief = state.arrays()
-            if work is None:
-                returned = fuse_in_order(measurements, k, tracks, belief, limits, verdicts, nis)
-            else:
-                returned = fuse(measurements, k, stage, -1, tracks, belief, limits, work, verdicts, nis)
-            k, why, source, loss = returned
-            stage = PREDICT
-            if why == FINISHED:
+            if stage == update.PREDICT:
+                work = new_innovations(1, *self._sides)
+            k, why, source, loss = update.fuse(
+                measurements, k, stage, -1, tracks, belief, limits, work, verdicts, nis
+            )
+            stage = update.PREDICT
+            if why == update.FINISHED:
                 return
-            if why == IS_LINK and work is not None:
-                evaluate_link(measurements.row(k), 0, tracks, belief, state.filter, work)
-                stage = ATTRIBUTE
-            elif why == LOST:
+            if why == update.IS_LINK:
+                update.evaluate_link(measurements.row(k), 0, tracks, belief, state.filter, work)
+                stage = update.ATTRIBUTE
+            elif why == update.LOST:
                 state.deinitialize(source, LossReason(loss), int(measurements.stamp_ns[k]))
                 # one that was not evaluated is fused again, as is a fix that locates the lost robot alone
                 if loss != LossReason.UNCERTAIN and (
-                    verdicts[k] == Verdict.USED or not locates_alone(measurements, k)
+                    verdicts[k] == Verdict.USED or not models.locates_alone(measurements, k)
                 ):
                     k += 1
-            elif why == CONTRADICTED:
+            elif why == update.CONTRADICTED:
                 self._augment(state, source, int(measurements.stamp_ns[k]))
             elif not self.starts.initialize_measured(state, select(measurements, slice(k, k + 1))):
                 verdicts[k] = self._note(state, measurements.row(k))
@@ -333,7 +271,7 @@ class Fusion:
         middle_ns = middle_of_period(int(rows.stamp_ns[0]), self._period_ns)
         # Predict; measurements of robots that are too uncertain now are left out.
         work = new_innovations(rows.size, *self._sides)
-        fuse(rows, 0, PREDICT, middle_ns, tracks, state.arrays(), limits, work, verdicts, nis)
+        update.fuse(rows, 0, update.PREDICT, middle_ns, tracks, state.arrays(), limits, work, verdicts, nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         good = ~(lost[rows.observer] | lost[rows.target])
@@ -349,13 +287,13 @@ class Fusion:
         places = Robots(
             self._poses(state, np.full(state.tracked.size, newest_ns))[:, :2], state.tracked.copy()
         )
-        state.filter.prepare_update(related_columns(rows, belief), places, work.cross_covariance)
-        stage, why = EVALUATE, IS_LINK
-        while why == IS_LINK:
-            _, why, _, _ = fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, outcome, own_nis)
-            for k in np.flatnonzero(~is_compiled(rows.model)).tolist() if why == IS_LINK else ():
-                evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
-            stage = ATTRIBUTE
+        state.filter.prepare_update(update.related_columns(rows, belief), places, work.cross_covariance)
+        stage, why, links = update.EVALUATE, update.IS_LINK, np.flatnonzero(~models.is_compiled(rows.model))
+        while why == update.IS_LINK:
+            returned = update.fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, outcome, own_nis)
+            stage, why = update.ATTRIBUTE, returned[1]
+            for k in links.tolist() if why == update.IS_LINK else ():
+                update.evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
         # Correct and count.
         if work.accepted.any():
             used = slice(None) if work.accepted.all() else work.accepted
@@ -364,14 +302,14 @@ class Fusion:
             correction = state.filter.update(work.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
-            note_batch(rows, belief, covariances, work)
-        fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
+            correlated_noise.note_batch(rows, belief, covariances, work)
+        update.fuse(rows, 0, update.SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         for source in np.flatnonzero(work.contradicted).tolist():
             self._augment(state, source, newest_ns)
         for k in np.flatnonzero(~work.accepted & lost[rows.target]).tolist():
-            if locates_alone(rows, k) and not state.tracked[rows.target[k]]:
+            if models.locates_alone(rows, k) and not state.tracked[rows.target[k]]:
                 outcome[k] = self._note(state, rows.row(k))
         verdicts[good], nis[good] = outcome, own_nis
         return verdicts, nis
@@ -390,30 +328,30 @@ class Fusion:
 
     def _note(self, state: SwarmState, one: Measurements, keep: Keep | None = None) -> Verdict:
         """Store a row of measurements as a constraint if it can initialize a robot, or what `keep` does."""
-        initializes, keep = MODELS[int(one.model)].initializes, keep or self._initializer.note
+        initializes, keep = models.MODELS[int(one.model)].initializes, keep or self._initializer.note
         alone = initializes == "alone"
         if self._is_suspended(state, one):
             return Verdict.GATED
         direction = self._first_direction + int(one.target)
         if one.observer == NOBODY and state.sources.score[direction] >= self._limits.max_fault_score:
             one = one._replace(has_heading=_NO, has_second=_NO)
-        if not initializes or not keep(state, at_initialization(one) if alone else one):
+        if not initializes or not keep(state, correlated_noise.at_initialization(one) if alone else one):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one.observer, one.target])
         if self._pairs and (sides >= 0).all() and alone:
             tracks = self._tracks.at(sides, np.repeat(one.stamp_ns, 2))
-            record_constraint(one, state.arrays(), tracks)
+            correlated_noise.record_constraint(one, state.arrays(), tracks)
         return Verdict.CONSTRAINT
 
     def _is_suspended(self, state: SwarmState, one: Measurements) -> bool:
         """Whether the camera or fixes of a row are suspended; those of a lost robot recover."""
-        if one.observer != NOBODY or int(one.model) not in COMPILED:
+        if one.observer != NOBODY or int(one.model) not in models.COMPILED:
             return False
         robots, score, limit = state.tracked.size, state.sources.score, self._limits.max_fault_score
         robot, last_ns = int(one.target), state.sources.measured_ns
         source = self._first_direction - robots + robot if one.mount == NOBODY else robots + int(one.mount)
-        if score[source] >= limit and one.stamp_ns - last_ns[robot] >= CORRELATION_NS:
-            last_ns[robot], score[source] = one.stamp_ns, score[source] - RELIEF
+        if score[source] >= limit and one.stamp_ns - last_ns[robot] >= sources.CORRELATION_NS:
+            last_ns[robot], score[source] = one.stamp_ns, score[source] - sources.RELIEF
         return bool(score[source] >= limit)
 
     def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
@@ -423,36 +361,29 @@ class Fusion:
         that is contradicted again is suspended.
         """
         robots, limit = state.tracked.size, self._limits.max_fault_score
-        if source < robots and (is_kidnapped(state.sources, source) or not self._sees[source]):
+        if source < robots and (sources.is_kidnapped(state.sources, source) or not self._sees[source]):
             links, score = state.sources.source[source], state.sources.score
-            suspect = (score[links[(links >= robots) & (links < score.size)]] >= SUSPECT).any()
+            suspect = (score[links[(links >= robots) & (links < score.size)]] >= sources.SUSPECT).any()
             if not self._sees[source] and not suspect:
                 direction = self._first_direction + source
                 score[direction] = max(score[direction], limit + 1.0)
             state.deinitialize(source, LossReason.KIDNAPPED, stamp_ns)
             return
         # where they are predicted to: other poses change with later odometry, and nothing is fused again
-        poses, again_ns = (
-            self._poses(state, state.predicted_to_ns),
-            state.contradicted_ns[source] + _SETTLING_NS,
-        )
+        poses = self._poses(state, state.predicted_to_ns)
+        again_ns = state.contradicted_ns[source] + _SETTLING_NS
         state.contradicted_ns[source] = stamp_ns
         if source >= robots + self._first_mount:
             state.augment(source, poses[0])
             state.sources.score[source] = 2.0 * limit if stamp_ns < again_ns else 0.0
             return
-        exact = self._table.survey_column < 0
-        if (
-            state.is_doubted
-            or robots > self._policy.reopen_all_up_to
-            or (
-                bad_share(state.sources, stamp_ns) < DOUBTED_SHARE
-                and np.sum(exact & (state.contradicted_ns[robots:] > stamp_ns - _AT_ONCE_NS)) < _MANY
-            )
-        ):
-            state.augment(source, poses[min(source, robots - 1)])
-        else:
+        exact, contradicted_ns = self._table.survey_column < 0, state.contradicted_ns[robots:]
+        are_many = np.sum(exact & (contradicted_ns > stamp_ns - _AT_ONCE_NS)) >= _MANY
+        is_wrong = are_many or sources.bad_share(state.sources, stamp_ns) >= sources.DOUBTED_SHARE
+        if is_wrong and not state.is_doubted and robots <= self._policy.reopen_all_up_to:
             state.augment_all(poses)
+        else:
+            state.augment(source, poses[min(source, robots - 1)])
 
     def _execute(self, state: SwarmState, command: Command) -> None:
         """Set the pose of a robot, or deinitialize it, or change the map."""
@@ -478,7 +409,7 @@ class Fusion:
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
         initial = InitialPose(transform, se2.error_covariance(pose, covariance))
         if state.origin == IN_MAP:
-            state.initialize(robot, initial, at, WELL_CONFIRMED)
+            state.initialize(robot, initial, at, sources.WELL_CONFIRMED)
         else:
             self._local.move_to_map(state, robot, initial, at)
 
@@ -488,7 +419,7 @@ _NO_IMAGE_NS = np.iinfo(np.int64).min
 
 def _parts(measurements: Measurements) -> list[slice]:
     """Parts of measurements (m,) in order that are fused in one way: an aerial image, a scan, or others."""
-    anonymous, scan = (measurements.model == model for model in (ANONYMOUS, SCAN))
+    anonymous, scan = (measurements.model == model for model in (models.ANONYMOUS, models.SCAN))
     if not (anonymous.any() or scan.any()):
         return [slice(0, measurements.size)]
     image_ns = np.where(anonymous, measurements.stamp_ns, _NO_IMAGE_NS)

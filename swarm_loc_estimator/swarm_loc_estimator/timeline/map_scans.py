@@ -98,11 +98,7 @@ class Match(NamedTuple):
 
 
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
-    """Prepare a map for matching.
-
-    Args:
-        occupancy: The map.
-        path: Its file, for errors.
+    """Prepare a map for matching; its file is for errors.
 
     Raises:
         MapFileError: No cell is occupied, or none is free.
@@ -166,15 +162,10 @@ def match(
     predicted: FloatArray,
     covariance: FloatArray,
 ) -> Match:
-    """Match a sweep to a map from a predicted pose.
+    """Match a sweep to a map from a predicted pose (3,) with its covariance (3, 3).
 
-    Args:
-        walls: The map.
-        ends: (n, 2) ends of beams that met something, in the frame of the robot [m].
-        origin: (2,) the lidar in that frame [m].
-        variance: (n,) of their distances [m^2].
-        predicted: (3,) pose.
-        covariance: (3, 3) of the predicted pose.
+    `ends` (n, 2) are of beams that met something, in the frame of the robot, `origin` (2,) is the lidar there
+    [m], `variance` (n,) that of the distances [m^2].
     """
     pose, scale = predicted.copy(), 1.0
     for k in range(len(ends)):
@@ -195,6 +186,7 @@ def match(
         result[i, i] += walls.variance * (_SHARED_TURN / (scale * scale) if i == 2 else _SHARED)
     fitting, blocked, through, misfit = _classified(walls, ends, origin, variance, pose)
     tried = max(fitting + blocked + through, 1)
+    result *= max(1.0, misfit / tried)  # the map errs more than is described
     shift = pose - predicted
     distance = np.dot(shift, np.linalg.solve(covariance + result, shift))
     outcome = FITS
@@ -213,13 +205,7 @@ def normal_equations(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The information (3, 3) of a sweep on a pose (3,), the part that normals imitate, and the gradient (3,).
 
-    Args:
-        walls: The map.
-        ends: (n, 2), see `match`.
-        origin: (2,).
-        variance: (n,).
-        pose: (3,) where the beams are compared with the map.
-        reach: Maximum distance from a wall [m]; 0: each beam's own.
+    `reach` is the maximum distance from a wall [m]; 0: each beam's own. For the sweep see `match`.
     """
     count, cos, sin = len(ends), math.cos(pose[2]), math.sin(pose[2])
     rows, residual, noise = np.zeros((count, 6)), np.zeros(count), np.zeros(count)
@@ -273,13 +259,7 @@ def _near(walls: WallMap, variance: float) -> float:
 def _inverted(
     information: FloatArray, imitated: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known.
-
-    Args:
-        information: (3, 3).
-        imitated: (3, 3) what errors of normals imitate of it.
-        scale: Mean distance of the ends [m], by which angles are compared with positions.
-    """
+    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known."""
     unit = np.diag(np.array([1.0, 1.0, 1.0 / scale]))
     values, axes = np.linalg.eigh(np.dot(unit, np.dot(information, unit)))
     vectors = np.ascontiguousarray(axes.T)
@@ -300,10 +280,7 @@ def _inverted(
 def _classified(
     walls: WallMap, ends: FloatArray, origin: FloatArray, variance: FloatArray, pose: FloatArray
 ) -> tuple[int, int, int, float]:
-    """Numbers of beams that fit walls, end where the map is free, and go through walls.
-
-    And the sum of their squared distances from walls, in variances, `_MAX_MISFIT` at most.
-    """
+    """Numbers of beams that fit, end where it is free, and go through walls; the sum of squared distances."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     from_x = pose[0] + cos * origin[0] - sin * origin[1]
     from_y = pose[1] + sin * origin[0] + cos * origin[1]
@@ -367,7 +344,7 @@ _ALL, SURE_FIT = 3, 0.65
 those at home are seen now and then."""
 _LEFT_OUT, _LEFT_OUT_SHARE = np.array([0.1, 0.1, 0.1]), 0.2
 """Motion that odometry has left out [m, m, rad], and share of a motion by which calibration changes it."""
-_UNKNOWN_MOTION = np.square([0.5, 0.5, 0.5])  # Variances from which nothing is known of it [m^2, m^2, rad^2]
+_NEARLY_LOST = 0.7  # Standard deviation, over that of a lost robot, from which nothing is known of a motion
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
@@ -388,20 +365,12 @@ class MatchedScan(NamedTuple):
     track: FloatArray  # (L, 3) poses by odometry in the middle of the sweep, at each lag
     back: FloatArray  # (3,) from the pose at its stamp to that in the middle, at the likeliest lag
     anchor: FloatArray  # (3, 3) of `DelayBelief`, if it is where it was matched
-    reported: (
-        FloatArray | None
-    )  # (3,) pose by a motion that odometry has left out; None: it has left out none
+    reported: FloatArray | None  # (3,) pose by a motion that odometry has left out, if it has
+    follows: bool  # Whether it was matched where the scan before and odometry put it
 
 
 class MapScans:
-    """Matches scans to the known map.
-
-    Args:
-        swarm: Robots with lidars.
-        settings: Thresholds of lost robots.
-        tracks: Odometry of the robots.
-        sweeps: Sweeps by robot and stamp.
-    """
+    """Matches scans to the known map; sweeps are by robot and stamp."""
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self.tracks, self._sweeps = tracks, sweeps
@@ -433,30 +402,33 @@ class MapScans:
         covariance = covariance + doubt
         found = match(walls, *beams, pose, covariance)
         # Its beams may be measured in the other order.
-        news = None
-        if abs(delay.backwards) < _ORDER_KNOWN:
-            news = 0.0 if self.turned(robot, sweep) > _ORDER_TURN else None
-        if news is not None or delay.backwards > 0.0:
+        is_open = abs(delay.backwards) < _ORDER_KNOWN and self.turned(robot, sweep) > _ORDER_TURN
+        if is_open or delay.backwards > 0.0:
             reversed_beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
             other = match(walls, *reversed_beams, pose, covariance)
-            if news is not None:
-                news = _ORDER_WEIGHT * (found.misfit - other.misfit)
-                news = min(max(news, -_ORDER_NEWS), _ORDER_NEWS)
-                delay = delay._replace(backwards=delay.backwards + news)
+            news = min(max(_ORDER_WEIGHT * (found.misfit - other.misfit), -_ORDER_NEWS), _ORDER_NEWS)
+            delay = delay._replace(backwards=delay.backwards + (news if is_open else 0.0))
             if delay.backwards > 0.0:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
-        # Odometry may have left out a motion that it reports.
-        sample, reported = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None
+        # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
+        sample = self.tracks.at(np.array([robot]), np.array([stamp_ns]))
+        reported: FloatArray | None = None
+        follows = False
         anchor = np.stack([found.pose, now, sample.raw[0]])
         if not np.isnan(delay.anchor).any():
-            used, moved = between(delay.anchor[1:], anchor[1:])
-            used[2], moved[2] = wrap_angle([used[2], moved[2]])
-            slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.abs([math.hypot(moved[0], moved[1])] * 2 + [moved[2]])
-            if (np.abs(moved - used) > slack).any() or (np.diag(covariance) > _UNKNOWN_MOTION).any():
+            motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
+            motions[:, 2] = wrap_angle(motions[:, 2])
+            seen, used, moved = motions
+            path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
+            slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
+            follows = bool((np.abs(seen - used) < slack).all())
+            limits = self._limits.position_sigma, self._limits.position_sigma, self._limits.heading_sigma
+            is_unknown = (np.diag(covariance) > np.square(_NEARLY_LOST * np.array(limits))).any()
+            if is_unknown or (np.abs(moved - used) > slack).any():
                 reported = compose(delay.anchor[0], moved)
         return MatchedScan(
-            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported
+            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported, follows
         )
 
     def fix_of(self, state: SwarmState, scan: MatchedScan) -> tuple[Measurements | None, Verdict, bool]:

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
@@ -33,6 +33,7 @@ from swarm_loc_estimator.sensors.lidar import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
+    FAR,
     FITS,
     FREE,
     OFF_MAP,
@@ -69,6 +70,7 @@ _AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
 """Least and greatest steps in which a located robot is sought around its prediction [m, m, rad]."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
+_GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 _SAME = np.diag(np.square([0.05, 0.05, 0.03]))
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
@@ -185,22 +187,15 @@ def described_map(swarm: Swarm) -> SearchMap | None:
 
 
 class MapSearch:
-    """Searches places in the known map.
-
-    Args:
-        scans: What knows the beams of sweeps.
-        swarm: The robots.
-    """
+    """Searches places of robots in the known map; `scans` knows the beams of sweeps."""
 
     def __init__(self, scans: MapScans, swarm: Swarm) -> None:
         self._scans, self._robots = scans, swarm.robots
 
     def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
-        """Search the place of a robot that is not located, by its scan; returns it once it is found.
+        """Search the place of a robot that is not located, by the row of its scan; returns it once found.
 
-        Args:
-            state: With a map; what is known of places is changed.
-            one: Row of the scan.
+        What the state, which has a map, knows of places is changed.
         """
         robot, stamp_ns, scans = int(one.target), int(one.stamp_ns), self._scans
         sweep, described = scans.sweep_of(one), self._robots[robot]
@@ -229,9 +224,13 @@ class MapSearch:
         Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
         counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
         """
-        is_usual = scan.found.outcome == FITS and scan.found.fitting >= SURE_FIT and scan.reported is None
-        if is_usual or state.sources.confirmations[scan.robot] < CONFIRMED:
+        # whether it is where it was predicted
+        square = _squared(scan.found.pose, scan.predicted, scan.covariance + scan.found.covariance)
+        fits = scan.found.outcome in (FITS, FAR) and scan.found.fitting >= SURE_FIT
+        is_known = scan.reported is not None or (scan.follows and fits and square > _GATED)
+        if state.sources.confirmations[scan.robot] < CONFIRMED or (fits and not is_known):
             return None
+        # places around the prediction, and around what odometry reports
         beams = SweptBeams.thinned(*scan.beams)
         points = _spread(beams.ends)
         sigma = np.clip(np.sqrt(np.diag(scan.covariance)), *_AROUND)
@@ -243,16 +242,15 @@ class MapSearch:
         score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
         order = _largest(score, len(score))
         kept = order[_separate(poses[order], score[order], _NEAR_BY)]
+        # the one that explains the scan, if no other does
         found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
         found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
-        least = SURE_FIT if scan.reported is not None else max(SURE_FIT, scan.found.fitting + _DECLINE)
+        least = SURE_FIT if is_known else max(SURE_FIT, scan.found.fitting + _DECLINE)
         if not found or found[0].fitting < least:
             return None
         best = found[0]
         for other in found[1:]:
-            off = between(best.pose, other.pose)
-            off[2] = wrap_angle(off[2])
-            square = off @ np.linalg.solve(best.covariance + other.covariance + _SAME, off)
+            square = _squared(best.pose, other.pose, best.covariance + other.covariance + _SAME)
             if square > _RIVAL and other.fitting > best.fitting - _DECLINE:
                 return None
         information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
@@ -268,18 +266,7 @@ class MapSearch:
         track: FloatArray,
         known: SearchMap,
     ) -> tuple[PossiblePlaces, FoundPlace | None]:
-        """Follow the places of a robot by a scan.
-
-        Args:
-            before: What is known; None: nothing.
-            stamp_ns: Stamp of the scan.
-            beams: The scan.
-            track: (3,) pose by odometry.
-            known: The map, with the error of its walls.
-
-        Returns:
-            What is known then, and the place where the robot is, once it is found.
-        """
+        """Follow places by a scan at a pose (3,) by odometry; the robot's place, too, once it is found."""
         if before is None or not len(before.transform):
             paused_ns = 0 if before is None else before.pause_ns
             if before is not None and stamp_ns < before.searched_ns + paused_ns:
@@ -288,14 +275,14 @@ class MapSearch:
             look = Look(beams, track)
             begun = PossiblePlaces(np.zeros((0, 3)), np.zeros((0, 1)), (look,), stamp_ns, pause_ns)
             return self._advanced(begun, PlaceSearch(), known), None
-        away, turn = _moved(before.looks[-1].track, track)
+        x, y, turn = between(before.looks[-1].track, track)
+        away, turn = math.hypot(x, y), abs(float(wrap_angle(turn)))
         is_look = away >= _LOOK_M or turn >= _LOOK_TURN
         if not (is_look or before.is_sole):
             return before, None
         # match each place again, and rule out what explains less
-        covariance = np.diag(
-            [_SLIP[0] + _SLIP[2] * away, _SLIP[0] + _SLIP[2] * away, _SLIP[1] + _SLIP[2] * turn]
-        )
+        slip = _SLIP[0] + _SLIP[2] * away
+        covariance = np.diag([slip, slip, _SLIP[1] + _SLIP[2] * turn])
         found = [match(known.walls, *beams, compose(one, track), covariance**2) for one in before.transform]
         poses = np.array([one.pose for one in found])
         fits = np.column_stack([before.fits, [_fit(one) for one in found]])
@@ -347,11 +334,8 @@ class MapSearch:
             else:
                 transform.append(latest)
                 fits.append(own)
-        search = search._replace(
-            poses=search.poses[tried:],
-            transform=(*search.transform, *transform),
-            fits=(*search.fits, *fits),
-        )
+        transforms, every = (*search.transform, *transform), (*search.fits, *fits)
+        search = search._replace(poses=search.poses[tried:], transform=transforms, fits=every)
         return places._replace(search=search) if len(search.poses) else _searched(places, search)
 
 
@@ -360,10 +344,11 @@ def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:
     transform = np.concatenate([places.transform, np.reshape(search.transform, (-1, 3))])
     fits = np.concatenate([places.fits, np.reshape(search.fits, (-1, len(places.looks)))])
     poses, known = compose(transform, places.looks[-1].track), len(places.transform)
-    others = np.arange(known, len(poses))
-    if known:
-        others = others[_apart(poses[0], poses[known:])]
-    others = np.concatenate([np.arange(known), others])
+    others = np.arange(len(poses))
+    if known:  # other places than the known one
+        off = poses - poses[0]
+        is_apart = (np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART)
+        others = others[is_apart | (others < known)]
     kept = others[_best(poses[others], fits[others])][:_HYPOTHESES]
     kept = kept[fits[kept].sum(axis=1) > 0.0]
     is_complete = len(places.looks) >= _LOOKS
@@ -503,13 +488,8 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     return kept
 
 
-def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
-    """Distance [m] and absolute turn [rad] from a pose (3,) to another."""
-    x, y, turn = between(before, now)
-    return math.hypot(x, y), abs(float(wrap_angle(turn)))
-
-
-def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:
-    """Which poses (n, 3) are other places than a pose (3,)."""
-    off = others - pose
-    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART))
+def _squared(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
+    """Squared distance of two poses (3,), in variances."""
+    off = other - pose
+    off[2] = wrap_angle(off[2])
+    return float(off @ np.linalg.solve(covariance, off))

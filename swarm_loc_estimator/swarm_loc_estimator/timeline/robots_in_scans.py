@@ -19,8 +19,7 @@ from swarm_loc_estimator.common.se2 import between, inverse, transform_points
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.identification.assignment import UNSEEN, assign, log_ratios
-from swarm_loc_estimator.identification.picture import Picture
+from swarm_loc_estimator.identification.picture import UNSEEN, Picture, assign, log_ratios
 from swarm_loc_estimator.mapping.messages import LidarSweep
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
 from swarm_loc_estimator.sensors.lidar import described_delay
@@ -56,13 +55,7 @@ class Discs(NamedTuple):
 
 
 class RobotsInScans:
-    """Finds located robots in scans.
-
-    Args:
-        swarm: Robots with lidars.
-        settings: Required probability and gate of an assignment.
-        scans: What knows the beams of sweeps.
-    """
+    """Finds located robots in scans; `scans` knows the beams of sweeps."""
 
     def __init__(self, swarm: Swarm, settings: Settings, scans: MapScans) -> None:
         self._scans, self._lidars = scans, [robot.lidar for robot in swarm.robots]
@@ -74,13 +67,7 @@ class RobotsInScans:
     def seen(
         self, state: SwarmState, one: Measurements, sweep: LidarSweep
     ) -> tuple[LidarSweep, Measurements]:
-        """The sweep without the beams that end at located robots, and the sightings (k,) of them.
-
-        Args:
-            state: Not changed.
-            one: Row of the scan, whose robot is located.
-            sweep: Its beams.
-        """
+        """The sweep of a located robot without the beams that end at others, and sightings (k,) of these."""
         robot, stamp_ns, tracks = int(one.target), int(one.stamp_ns), self._scans.tracks
         lidar, known = self._lidars[robot], state.tracked.copy()
         known[robot] = False
@@ -156,12 +143,8 @@ def discs(
 ) -> Discs:
     """Find what may be discs of a radius [m].
 
-    Args:
-        ends: (n, 2) of the beams that met something, in their order.
-        origin: (2,) of the lidar.
-        variance: (n,) of the ranges [m^2].
-        angle: (n,) directions of the beams by the lidar [rad].
-        radius: Of a disc [m].
+    `ends` (n, 2) are of the beams that met something, in their order, from the origin (2,) of the lidar, with
+    the variance (n,) of the ranges [m^2] and the directions (n,) by the lidar [rad].
     """
     count, disc = len(ends), np.full(len(ends), -1)
     centre, noise, size = np.zeros((count, 2)), np.zeros((count, 2)), 0

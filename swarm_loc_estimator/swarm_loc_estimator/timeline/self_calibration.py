@@ -39,9 +39,7 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. What places share of their errors is apart.
     """
     error, shared = _shared(swarm, state)
-    surveyed: list[Any] = [
-        _placed(mark, index, state, shared[index]) for index, mark in enumerate(swarm.surveyed)
-    ]
+    surveyed: list[Any] = [_placed(one, k, state, shared[k]) for k, one in enumerate(swarm.surveyed)]
     marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
     return replace(
         swarm,

@@ -147,11 +147,7 @@ def _merge(
     end: int,
     new: Measurements,
 ) -> tuple[int, int]:
-    """Merge new measurements into rows `begin` to `end`; space after them must be reserved.
-
-    Returns:
-        Number of inserted rows, and the stamp of the first one.
-    """
+    """Merge measurements into rows with space after them; return how many, and the stamp of the first."""
     # Sort the new rows: by stamp, then those with equal stamps by all columns.
     order = np.argsort(new.stamp_ns, kind="mergesort")
     for k in range(1, order.size):
@@ -225,68 +221,41 @@ def _lower_bound(columns: Measurements, place: int, end: int, new: Measurements,
 @inlined_njit
 def _compared(a: Measurements, i: int, b: Measurements, j: int) -> int:
     """Compare row i of measurements with row j of others: -1 if it is less, 1 if greater, 0 if equal."""
-    if a.stamp_ns[i] != b.stamp_ns[j]:
-        return -1 if a.stamp_ns[i] < b.stamp_ns[j] else 1
-    if a.observer[i] != b.observer[j]:
-        return -1 if a.observer[i] < b.observer[j] else 1
-    if a.target[i] != b.target[j]:
-        return -1 if a.target[i] < b.target[j] else 1
-    if a.reading[i] != b.reading[j]:
-        return -1 if a.reading[i] < b.reading[j] else 1
-    if a.model[i] != b.model[j]:
-        return -1 if a.model[i] < b.model[j] else 1
-    return _compared_further(a, i, b, j)
+    order = _sign(a.stamp_ns[i], b.stamp_ns[j]) or _sign(a.observer[i], b.observer[j])
+    order = order or _sign(a.target[i], b.target[j]) or _sign(a.reading[i], b.reading[j])
+    return order or _sign(a.model[i], b.model[j]) or _compared_further(a, i, b, j)
 
 
 @cached_njit
 def _compared_further(a: Measurements, i: int, b: Measurements, j: int) -> int:
     """The same for measurements that their first columns do not tell apart: they contradict each other."""
+    order = 0
     for r in range(2, -1, -1):
-        order = _compared_vectors(a.covariance[i, r], b.covariance[j, r])
-        if order != 0:
-            return order
-    order = _compared_vectors(a.second[i], b.second[j])
-    if order != 0:
-        return order
-    order = _compared_vectors(a.value[i], b.value[j])
-    if order != 0:
-        return order
-    if a.received_from[i] != b.received_from[j]:
-        return -1 if a.received_from[i] < b.received_from[j] else 1
-    if a.landmark[i] != b.landmark[j]:
-        return -1 if a.landmark[i] < b.landmark[j] else 1
-    if a.mount[i] != b.mount[j]:
-        return -1 if a.mount[i] < b.mount[j] else 1
-    if a.has_heading[i] != b.has_heading[j]:
-        return -1 if b.has_heading[j] else 1
-    if a.has_second[i] != b.has_second[j]:
-        return -1 if b.has_second[j] else 1
-    if a.stamp_variance[i] != b.stamp_variance[j]:
-        return -1 if a.stamp_variance[i] < b.stamp_variance[j] else 1
-    if a.gate[i] != b.gate[j]:
-        return -1 if a.gate[i] < b.gate[j] else 1
-    order = _compared_vectors(a.sensor[i], b.sensor[j])
-    if order != 0:
-        return order
-    order = _compared_vectors(a.marker[i], b.marker[j])
-    if order != 0:
-        return order
-    order = _compared_vectors(a.height[i], b.height[j])
-    if order != 0:
-        return order
-    order = _compared_vectors(a.reference[i], b.reference[j])
-    if order != 0:
-        return order
-    return _compared_vectors(a.systematic_share[i], b.systematic_share[j])
+        order = order or _vectors_compared(a.covariance[i, r], b.covariance[j, r])
+    order = order or _vectors_compared(a.second[i], b.second[j]) or _vectors_compared(a.value[i], b.value[j])
+    order = order or _sign(a.received_from[i], b.received_from[j]) or _sign(a.landmark[i], b.landmark[j])
+    order = order or _sign(a.mount[i], b.mount[j]) or _sign(a.has_heading[i], b.has_heading[j])
+    order = order or _sign(a.has_second[i], b.has_second[j])
+    order = order or _sign(a.stamp_variance[i], b.stamp_variance[j]) or _sign(a.gate[i], b.gate[j])
+    order = order or _vectors_compared(a.sensor[i], b.sensor[j])
+    order = order or _vectors_compared(a.marker[i], b.marker[j])
+    order = order or _vectors_compared(a.height[i], b.height[j])
+    order = order or _vectors_compared(a.reference[i], b.reference[j])
+    return order or _vectors_compared(a.systematic_share[i], b.systematic_share[j])
 
 
 @cached_njit
-def _compared_vectors(a: FloatArray, b: FloatArray) -> int:
+def _vectors_compared(a: FloatArray, b: FloatArray) -> int:
     """Compare vectors, last components first."""
+    order = 0
     for i in range(a.size - 1, -1, -1):
-        if a[i] != b[i]:
-            return -1 if a[i] < b[i] else 1
-    return 0
+        order = order or _sign(a[i], b[i])
+    return order
+
+
+@inlined_njit
+def _sign(a: float, b: float) -> int:
+    return int(a > b) - int(a < b)
 
 
 Step = Callable[[SwarmState, Measurements, Sequence[Command], NDArray[np.uint8], FloatArray], None]
@@ -298,18 +267,10 @@ _BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
 class Timeline:
-    """Buffered measurements with their verdicts, and the newest state.
+    """Buffered measurements with their verdicts, and the newest state, from an initial one on.
 
-    Args:
-        settings: Horizon and periods of the steps.
-        step: Fuses the measurements of one step into a state, see `Fusion.step`.
-        state: Initial state.
-        lookback_ns: Maximum time before its stamp at which late odometry may change measurements, which are
-            kept longer than the horizon by this time.
-
-    Attributes:
-        state: Newest complete state.
-        is_busy: True if the last `advance` left steps to compute.
+    A step fuses its measurements into a state, see `Fusion.step`. Measurements are kept longer than the
+    horizon by `lookback_ns`, the maximum time before its stamp at which late odometry may change them.
     """
 
     def __init__(self, settings: Settings, step: Step, state: SwarmState, lookback_ns: int) -> None:
@@ -324,8 +285,8 @@ class Timeline:
 
     def restart(self, state: SwarmState) -> None:
         """Drop all measurements and continue from `state`."""
-        self.state = self._ahead = state
-        self.is_busy = False
+        self.state = self._ahead = state  # The newest complete one, and the one that steps change
+        self.is_busy = False  # Whether the last `advance` left steps to compute
         self._head_key = _BEFORE_ALL
         # The step after which a state was copied, by the last stamp that belongs to it, and the copy.
         self._checkpoints = [(_BEFORE_ALL, state.copy())]
@@ -334,30 +295,10 @@ class Timeline:
         self._new_commands: list[Command] = []
         self._commands: list[Command] = []
         self._redo_from_ns: int | None = None
-        self._buffer = MeasurementBuffer()
+        self.buffer = MeasurementBuffer()  # Measurements within the horizon
         self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
         self.duplicates = 0
         self.too_old = 0
-
-    @property
-    def measurements(self) -> Measurements:
-        """Measurements (m,) within the horizon, sorted by stamp."""
-        return self._buffer.part(0, len(self._buffer))
-
-    @property
-    def stamp_ns(self) -> IntArray:
-        """Stamps (m,) of the measurements."""
-        return self._buffer.stamp_ns
-
-    @property
-    def verdicts(self) -> NDArray[np.uint8]:
-        """Verdicts (m,) of the measurements."""
-        return self._buffer.verdicts
-
-    @property
-    def nis(self) -> FloatArray:
-        """Normalized innovation squared (m,) of the measurements."""
-        return self._buffer.nis
 
     def add(self, measurements: Measurements) -> None:
         """Add measurements (m,), to be fused by the next `advance`."""
@@ -381,19 +322,15 @@ class Timeline:
     def oldest_due_ns(self, otherwise_ns: int) -> int:
         """Stamp of the oldest measurement left to fuse, at most `otherwise_ns`."""
         due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
-        due_ns += self._buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
+        due_ns += self.buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
         due_ns += [one.stamp_ns for one in self._commands if one.stamp_ns > self._head_key]
         return min(due_ns)
 
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
-        """Mark steps of robots with changed tracks to be computed again.
-
-        Args:
-            changed_from_ns: (N,) instant after which each robot's track has changed.
-        """
-        stamp_ns = self._buffer.stamp_ns
-        first = _first_touched(stamp_ns, *self._buffer.sides, changed_from_ns, self._fusion_period_ns)
-        if first < len(self._buffer):
+        """Mark steps of robots whose tracks have changed after an instant (N,) to be computed again."""
+        stamp_ns = self.buffer.stamp_ns
+        first = _first_touched(stamp_ns, *self.buffer.sides, changed_from_ns, self._fusion_period_ns)
+        if first < len(self.buffer):
             self._redo_from(int(stamp_ns[first]))
         for command in self._commands:
             if command.stamp_ns > changed_from_ns[command.robot]:
@@ -402,7 +339,7 @@ class Timeline:
 
     def verdict_counts(self) -> NDArray[np.int64]:
         """Number of measurements by verdict (len(Verdict),) since the last restart."""
-        return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
+        return self.settled + np.bincount(self.buffer.verdicts, minlength=len(Verdict))
 
     def advance(self, now_ns: int, has_budget: HasBudget = lambda: True) -> None:
         """Compute all steps affected by new or changed data, and drop data beyond the horizon.
@@ -415,11 +352,18 @@ class Timeline:
                 self._merge(now_ns - self._horizon_ns)
             if self._new_commands:
                 self._order(now_ns - self._horizon_ns)
-            if self._withdrawn:
-                self._remove(now_ns - self._horizon_ns)
+            if self._withdrawn:  # unless their replacements are rejected as too old
+                gone, self._withdrawn = self._not_older(self._withdrawn, now_ns - self._horizon_ns), []
+                if (first_ns := self.buffer.remove(gone)) is not None:
+                    self._redo_from(first_ns)
             if self._redo_from_ns is not None:
-                self._go_back(self._key(self._redo_from_ns))
-                self._redo_from_ns = None
+                # roll back to the last checkpoint before the step, unless that is ahead
+                key, self._redo_from_ns = self._key(self._redo_from_ns), None
+                if key <= self._head_key:
+                    while self._checkpoints[-1][0] >= key:
+                        self._checkpoints.pop()
+                    self._head_key, checkpoint = self._checkpoints[-1]
+                    self._ahead = checkpoint.copy()
         due_ns = _AFTER_ALL if self._fusion_delay_ns is None else now_ns - self._fusion_delay_ns
         self.is_busy = not self._compute(due_ns, has_budget)
         if not self.is_busy:
@@ -432,7 +376,7 @@ class Timeline:
 
     def _count_until(self, key: int) -> int:
         """Number of measurements in steps up to `key`."""
-        return int(self._buffer.stamp_ns.searchsorted(key, side="right"))
+        return int(self.buffer.stamp_ns.searchsorted(key, side="right"))
 
     def _redo_from(self, stamp_ns: int) -> None:
         """Mark the step of a stamp and all later ones for the next `advance`."""
@@ -443,7 +387,7 @@ class Timeline:
         given, new = sum(one.size for one in self._new), self._not_older(self._new, oldest_ns)
         self._new = []
         self.too_old += given - new.size
-        inserted, first_ns = self._buffer.merge(new)
+        inserted, first_ns = self.buffer.merge(new)
         self.duplicates += new.size - inserted
         if first_ns is not None:
             self._redo_from(first_ns)
@@ -460,30 +404,15 @@ class Timeline:
             self._redo_from(given.stamp_ns)
         self._new_commands = []
 
-    def _remove(self, oldest_ns: int) -> None:
-        """Remove withdrawn measurements, unless their replacements were rejected as too old."""
-        gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
-        first_ns = self._buffer.remove(gone)
-        if first_ns is not None:
-            self._redo_from(first_ns)
-
     def _not_older(self, parts: list[Measurements], oldest_ns: int) -> Measurements:
         """Select measurements (m,) whose stamps are not older than an instant."""
         rows = concatenate(parts)
         fresh = rows.stamp_ns >= oldest_ns
         return rows if fresh.all() else select(rows, fresh)
 
-    def _go_back(self, key: int) -> None:
-        """Roll back to the last checkpoint before step `key`, unless `key` is ahead."""
-        if key <= self._head_key:
-            while self._checkpoints[-1][0] >= key:
-                self._checkpoints.pop()
-            self._head_key = self._checkpoints[-1][0]
-            self._ahead = self._checkpoints[-1][1].copy()
-
     def _compute(self, due_ns: int, has_budget: HasBudget) -> bool:
         """Compute steps that end until `due_ns` within the budget; return whether all are done."""
-        buffer = self._buffer
+        buffer = self.buffer
         while True:
             # A run of steps up to the next checkpoint, which are computed together.
             begin = self._count_until(self._head_key)
@@ -522,8 +451,8 @@ class Timeline:
         del self._checkpoints[: older - 1]
         passed = self._count_until(self._checkpoints[0][0])
         self._commands = [one for one in self._commands if one.stamp_ns > self._checkpoints[0][0]]
-        self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
-        self._buffer.drop_first(passed)
+        self.settled += np.bincount(self.buffer.verdicts[:passed], minlength=len(Verdict))
+        self.buffer.drop_first(passed)
 
 
 @cached_njit
@@ -536,8 +465,7 @@ def _first_touched(
 ) -> int:
     """First measurement (of m, by stamp) of a robot whose track (of N) changed before it; m if none.
 
-    Changes before the prediction instant of its period count too. An anonymous detection may be of any
-    robot.
+    Changes before the prediction instant of its period count too; an anonymous detection may be of any robot.
     """
     if not stamps_ns.size:
         return 0

@@ -1,7 +1,4 @@
-"""Serialize visualization_msgs/MarkerArray of a swarm: a few markers for any number of robots.
-
-Robots are points of one list in the colours of their status; headings, 95 % ellipses and sightings are lines.
-"""
+"""Serialize visualization_msgs/MarkerArray of a swarm: a few lists of points and lines for all robots."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.messages.cdr import MARKERS, encode
 from swarm_loc_estimator.common.messages.poses import EstimateMessage
-from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.swarm.swarm import Pose2, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 LINE_LIST, CUBE_LIST, SPHERE_LIST, TEXT = 5, 6, 7, 9
@@ -39,8 +36,7 @@ _HEIGHT = 0.01
 _BODY_PER_WHEELS = 1.32  # Ratio of body diameter to wheel separation, as of an e-puck
 
 
-Marker = dict[str, Any]
-"""The fields of a visualization_msgs/Marker; those left out are zero, so that it lasts until the next."""
+Marker = dict[str, Any]  # Fields of a visualization_msgs/Marker; others are zero: it lasts until the next
 
 
 class MarkersEncoder:
@@ -52,7 +48,11 @@ class MarkersEncoder:
         widths = [robot.odometry.wheel_separation for robot in swarm.robots]
         self._size = _BODY_PER_WHEELS * float(np.median(widths)) if widths else 0.07
         self._landmarks = np.array([[one.x, one.y, one.z] for one in swarm.landmarks]).reshape(-1, 3)
-        self._faces = _faces(swarm.landmarks, self._size)
+        # lines from landmarks to where they face
+        facing = [(one.x, one.y, one.z, one.yaw) for one in swarm.landmarks if one.yaw is not None]
+        x, y, z, yaw = np.array(facing).reshape(-1, 4).T
+        ends = [x, y, z, x + self._size * np.cos(yaw), y + self._size * np.sin(yaw), z]
+        self._faces = np.stack(ends, axis=1).reshape(-1, 3)
         self._cameras = np.array([[one.x, one.y, one.z] for one in swarm.cameras]).reshape(-1, 3)
 
     def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
@@ -60,19 +60,18 @@ class MarkersEncoder:
         located: BoolArray = ~np.isnan(estimate.pose[:, 0])
         pose, size = estimate.pose[located], self._size
         colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
-        line = (0.15 * size, 0.0, 0.0)
+        around = ellipses(pose, estimate.covariance[located])
+        line, known = (0.15 * size, 0.0, 0.0), estimate.pose[estimate.heading_known]
+        ahead = known[:, :2] + size * np.column_stack([np.cos(known[:, 2]), np.sin(known[:, 2])])
+        headings = np.stack([known[:, :2], ahead], axis=1).reshape(-1, 2)
+        headings = np.column_stack([headings, np.full(len(headings), size)])
         markers = [
             _marker("landmarks", CUBE_LIST, (0.4 * size,) * 3, self._landmarks),
             _marker("landmarks_facing", LINE_LIST, line, self._faces),
             _marker("cameras", CUBE_LIST, (0.6 * size,) * 3, self._cameras),
             _marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
-            _marker("headings", LINE_LIST, line, _headings(estimate.pose[estimate.heading_known], size)),
-            _marker(
-                "ellipses_95",
-                LINE_LIST,
-                (0.06 * size, 0.0, 0.0),
-                ellipses(pose, estimate.covariance[located]),
-            ),
+            _marker("headings", LINE_LIST, line, headings),
+            _marker("ellipses_95", LINE_LIST, (0.06 * size, 0.0, 0.0), around),
         ]
         if sightings is not None:
             markers.append(self._sightings(estimate, sightings))
@@ -100,11 +99,7 @@ class MarkersEncoder:
 
 
 def _marker(
-    name: str,
-    kind: int,
-    scale: tuple[float, float, float],
-    points: FloatArray,
-    colours: FloatArray | None = None,
+    name: str, kind: int, scale: Pose2, points: FloatArray, colours: FloatArray | None = None
 ) -> Marker:
     """A marker of points (n, 3) in colours (n, 4), by default the ink."""
     return {
@@ -127,13 +122,6 @@ def _lifted(points: FloatArray) -> FloatArray:
     return np.column_stack([points[:, :2], np.full(len(points), _HEIGHT)])
 
 
-def _headings(pose: FloatArray, size: float) -> FloatArray:
-    """Lines (2 n, 3) from the middle of each robot ahead."""
-    ahead = pose[:, :2] + size * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-    points = np.stack([pose[:, :2], ahead], axis=1).reshape(-1, 2)
-    return np.column_stack([points, np.full(len(points), size)])
-
-
 def ellipses(pose: FloatArray, covariance: FloatArray) -> FloatArray:
     """Lines (n * 2 * corners, 3) around the 95 % ellipses of positions, of poses (n, 3) in map."""
     turn = 2.0 * np.pi * np.arange(_CORNERS + 1) / _CORNERS
@@ -143,13 +131,3 @@ def ellipses(pose: FloatArray, covariance: FloatArray) -> FloatArray:
     around: NDArray[np.float64] = pose[:, :2, None] + axes @ circle
     lines = np.stack([around[..., :-1], around[..., 1:]], axis=-1)  # (n, 2, corners, 2 ends)
     return _lifted(np.moveaxis(lines, 1, -1).reshape(-1, 2))
-
-
-def _faces(landmarks: tuple[Landmark, ...], size: float) -> FloatArray:
-    """Lines (2 n, 3) from landmarks to where they face."""
-    ends = [
-        [[one.x, one.y, one.z], [one.x + size * np.cos(one.yaw), one.y + size * np.sin(one.yaw), one.z]]
-        for one in landmarks
-        if one.yaw is not None
-    ]
-    return np.array(ends).reshape(-1, 3)

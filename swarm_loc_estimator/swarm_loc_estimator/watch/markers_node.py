@@ -19,15 +19,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
 
+from swarm_loc_estimator.common.messages import poses
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.poses import (
-    PLANE,
-    EstimateMessage,
-    SwarmPosesReader,
-    decode_odometry,
-    encode_odometry,
-    planar_covariance,
-)
+from swarm_loc_estimator.common.messages.poses import EstimateMessage, SwarmPosesReader
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.nodes.parameters import MarkersParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -74,7 +68,6 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             self._listen(f"{name}/odom", Odometry, partial(self._on_odometry, k), wanted=k in robots)
 
     def _listen(self, topic: str, message_class: type, use: Any, *, wanted: bool) -> None:
-        """Create or destroy a subscription."""
         if wanted and topic not in self._heard:
             take = partial(self._on_message, topic, use)
             self._heard[topic] = self.create_subscription(message_class, topic, take, _FLEETING, raw=True)
@@ -88,7 +81,7 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             self._warn(topic)
 
     def _on_odometry(self, robot: int, data: bytes) -> None:
-        self._twist[robot] = decode_odometry(data).twist
+        self._twist[robot] = poses.decode_odometry(data).twist
 
     def _on_sightings(self, data: bytes) -> None:
         self._seen = decode_sightings(data)
@@ -111,14 +104,12 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
         for k, publisher in enumerate(self._filtered):
             if not np.isfinite(estimate.pose[k]).all() or not publisher.get_subscription_count():
                 continue
-            covariance = planar_covariance(0.0, 0.0, 0.0)
-            covariance[PLANE] = estimate.covariance[k]
-            frames, stamps_ns = (
-                (estimate.frame_id, f"{self._names[k]}/base_link"),
-                np.array([estimate.stamp_ns]),
-            )
+            covariance = poses.planar_covariance(0.0, 0.0, 0.0)
+            covariance[poses.PLANE] = estimate.covariance[k]
+            frames = estimate.frame_id, f"{self._names[k]}/base_link"
+            stamps_ns = np.array([estimate.stamp_ns])
             twists = np.array([self._twist.get(k, _UNKNOWN_TWIST)])
-            messages = encode_odometry(*frames, stamps_ns, estimate.pose[k : k + 1], twists, covariance)
+            messages = poses.encode_odometry(*frames, stamps_ns, estimate.pose[k : k + 1], twists, covariance)
             publisher.publish(messages[0])
 
     def _warn(self, what: str) -> None:

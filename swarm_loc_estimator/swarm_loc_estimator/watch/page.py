@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -45,10 +46,7 @@ class Frame(NamedTuple):
 
 
 def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:
-    """A frame of columns by name (float64, float32, int32, uint8 or int8), each flattened.
-
-    `extra` are further entries of the header.
-    """
+    """A frame of columns by name (see `_TYPES`), each flattened; `extra` are other entries of its header."""
     flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
     listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
     header = json.dumps({"kind": kind, "stamp": stamp_ns * 1e-6, "columns": listed, **extra}).encode()
@@ -77,7 +75,7 @@ def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
     return pack("sightings", stamp_ns, sightings._asdict())
 
 
-def places_frame(kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64]) -> Frame:
+def places_frame(kind: str, stamp_ns: int, robot: Sequence[int], pose: FloatArray) -> Frame:
     """Poses (n, 3) in map of robots: ground truth or goals."""
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": np.array(robot, dtype=np.int32),
@@ -88,16 +86,8 @@ def places_frame(kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArr
     return pack(kind, stamp_ns, columns)
 
 
-def aerial_frame(
-    stamp_ns: int,
-    position: npt.NDArray[np.float64],
-    robot: npt.NDArray[np.integer],
-    probability: npt.NDArray[np.float64],
-) -> Frame:
-    """Detections of an aerial image: positions (n, 2) in map [m], and who each is with what probability (n,).
-
-    Robots are given by their index; -1: unknown.
-    """
+def aerial_frame(stamp_ns: int, position: FloatArray, robot: IntArray, probability: FloatArray) -> Frame:
+    """Detections in an aerial image: positions (n, 2) [m], robots by index or -1, and probabilities (n,)."""
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": robot.astype(np.int32),
         "x": position[:, 0],
@@ -169,7 +159,6 @@ _BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-
 
 @lru_cache(maxsize=1)
 def _parts() -> tuple[str, str, str]:
-    """Markup, style and script."""
     read = {path.name: path.read_text(encoding="utf-8") for path in _FOLDER.iterdir() if path.is_file()}
     own = "\n".join(read[f"{name}.js"] for name in _SCRIPTS)
     script = f'{read["uPlot.iife.min.js"]}\n(() => {{\n"use strict";\n{own}\n}})();\n'

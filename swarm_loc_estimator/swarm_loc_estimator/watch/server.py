@@ -15,7 +15,7 @@ import re
 import socket
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -26,8 +26,7 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.watch.page import Frame, History, content_security_policy, page
 
 MIN_TOKEN_LENGTH = 8
-GUESS_PERIOD_S = 1.0
-"""A client that has used its free guesses may send one wrong token per period of this length [s]."""
+GUESS_PERIOD_S = 1.0  # After its free guesses a client may send one wrong token per such period [s]
 _FREE_GUESSES = 5
 MIN_DISTINCT = 5  # Least number of different characters of a token
 _BLOCKS = (1, 2, 3, 4), (4, 6, 8, 16)  # Bytes of blocks of IPv4 and IPv6 addresses, from wide to narrow
@@ -151,8 +150,7 @@ _LOG_PERIOD_S = 1.0
 Command = Mapping[str, Any]
 MAX_NOTES = 64  # Maximum number of texts queued for a slow page; the oldest are dropped first
 RECEIVED = "+"  # Acknowledgement of a frame by a page
-_MAX_ON_THE_WAY = 4
-"""Maximum number of unacknowledged frames; more would only age in the buffers of a busy page."""
+_MAX_ON_THE_WAY = 4  # Unacknowledged frames; more would only age in the buffers of a busy page
 
 
 class Answer(Protocol):
@@ -200,12 +198,9 @@ _LOG.addFilter(_OneLine())
 
 
 class WatchServer:
-    """Serves the page.
+    """Serves the page, with at most `rate` frames of a kind per second to each; port 0 is any free one.
 
-    Port 0 is any free one. A page gets at most `rate` frames of a kind per second.
-
-    Raises:
-        ServerError: The port is taken, or the address is not this machine's.
+    Raises ServerError if the port is taken, or the address is not this machine's.
     """
 
     def __init__(
@@ -218,7 +213,7 @@ class WatchServer:
         self._history = History()
         self._viewers: set[Viewer] = set()
         self._sockets: set[Connection] = set()
-        self._gone = LeftOut(0, 0)
+        self._gone = Counter[str]()  # Dropped messages of closed pages
         self._refused = 0
         self._known_left_out: dict[int, int] = {}
         self._loop = asyncio.new_event_loop()
@@ -261,9 +256,10 @@ class WatchServer:
     def load(self) -> ServerLoad:
         """The present load; `slow` counts since the last call."""
         counts = {id(viewer): viewer.left_out for viewer in tuple(self._viewers)}
-        slow = sum(count.frames > self._known_left_out.get(key, 0) for key, count in counts.items())
-        self._known_left_out = {key: count.frames for key, count in counts.items()}
-        frames, texts = (sum(parts) for parts in zip(self._gone, *counts.values(), strict=True))
+        slow = sum(count["frames"] > self._known_left_out.get(key, 0) for key, count in counts.items())
+        self._known_left_out = {key: count["frames"] for key, count in counts.items()}
+        left_out = (self._gone, *counts.values())
+        frames, texts = (sum(one[kind] for one in left_out) for kind in ("frames", "texts"))
         return ServerLoad(len(counts), slow, frames, texts, self._refused)
 
     def publish(self, frame: Frame) -> None:
@@ -295,8 +291,7 @@ class WatchServer:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._runner.setup())
-            site = web.TCPSite(self._runner, self._access.address, port)
-            self._loop.run_until_complete(site.start())
+            self._loop.run_until_complete(web.TCPSite(self._runner, self._access.address, port).start())
             self._listening.set()
             self._close_slow_requests({})
             self._loop.run_forever()
@@ -322,7 +317,6 @@ class WatchServer:
         self._loop.call_later(_SWEEP_PERIOD_S, self._close_slow_requests, waiting)
 
     def _check(self, request: web.Request) -> None:
-        """Refuse requests without access."""
         hosts, origins = (request.headers.getall(name, []) for name in ("Host", "Origin"))
         refusal = self._access.refusal(
             hosts[0] if len(hosts) == 1 else "",
@@ -365,7 +359,7 @@ class WatchServer:
         finally:
             self._viewers.discard(viewer)
             self._sockets.discard(request.protocol)
-            self._gone = LeftOut(*map(sum, zip(self._gone, viewer.left_out, strict=True)))
+            self._gone += viewer.left_out
             sending.cancel()
         return socket
 
@@ -379,14 +373,12 @@ class WatchServer:
             await socket.close()
 
     def _on_text(self, viewer: Viewer, text: str) -> None:
-        """Handle a text that a page has sent."""
         if text == RECEIVED:
             viewer.on_received()
             return
 
         def answer(said: str, *, ok: bool = True) -> None:
-            message = {"kind": "said", "text": said, "ok": ok}
-            self._loop.call_soon_threadsafe(viewer.note, message)
+            self._loop.call_soon_threadsafe(viewer.note, {"kind": "said", "text": said, "ok": ok})
 
         command = read_command(text)
         if command is None:
@@ -417,13 +409,6 @@ def read_command(text: str) -> Command | None:
     return command if is_valid else None
 
 
-class LeftOut(NamedTuple):
-    """Numbers of messages dropped for a page."""
-
-    frames: int  # Frames replaced by newer ones while the page was busy
-    texts: int  # Texts dropped from the full queue
-
-
 class Viewer:
     """Sends to one page; a slow page gets fewer frames, and its queues are bounded."""
 
@@ -435,19 +420,20 @@ class Viewer:
         self._wake = asyncio.Event()
         self._on_the_way = 0
         self.selected = -1  # Index of the robot whose numbers the page shows; -1: none
-        self.left_out = LeftOut(0, 0)  # Numbers of dropped messages
+        # Frames replaced by newer ones while the page was busy, and texts dropped from the full queue
+        self.left_out = Counter[str]()
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, replacing an older one of its kind."""
         if frame.kind in self._newest and self._on_the_way >= _MAX_ON_THE_WAY:
-            self.left_out = self.left_out._replace(frames=self.left_out.frames + 1)
+            self.left_out["frames"] += 1
         self._newest[frame.kind] = frame
         self._wake.set()
 
     def note(self, message: dict[str, Any]) -> None:
         """Queue a text."""
         if len(self._notes) == MAX_NOTES:
-            self.left_out = self.left_out._replace(texts=self.left_out.texts + 1)
+            self.left_out["texts"] += 1
         self._notes.append(json.dumps(message))
         self._wake.set()
 

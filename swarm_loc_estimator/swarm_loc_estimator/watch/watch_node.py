@@ -2,9 +2,7 @@
 
     ./run swarm_loc_estimator watch_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `swarm/poses`, `swarm/sightings` (while a page is open), `/diagnostics`, `aerial/detections`,
-`aerial/identities`, `map`, `<robot>/ground_truth` and `<robot>/goal`; and publishes `/diagnostics`, and
-`<robot>/cmd_vel` where driving is allowed. Parameters: see `doc/watch.md`.
+Topics and parameters: see `doc/watch.md`. It subscribes to `swarm/sightings` while a page is open.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ import queue
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,23 +37,10 @@ from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import decode_sightings
-from swarm_loc_estimator.watch.page import (
-    Frame,
-    about,
-    aerial_frame,
-    map_frame,
-    places_frame,
-    poses_frame,
-    sightings_frame,
-)
+from swarm_loc_estimator.watch import page
+from swarm_loc_estimator.watch.page import Frame
 from swarm_loc_estimator.watch.server import Access, Answer, Command, WatchServer
-from swarm_loc_msgs.msg import (
-    AnonymousDetectionArray,
-    RobotIdentities,
-    RobotIdentity,
-    SwarmPoses,
-    SwarmSightings,
-)
+from swarm_loc_msgs import msg
 from swarm_loc_msgs.srv import SetRobotPose
 
 _MAX_WAITING = 64
@@ -133,8 +119,7 @@ class RobotCommands:
             return
         robot = command["robot"]
         if robot not in self._velocity:
-            topic = f"{self._names[robot]}/cmd_vel"
-            self._velocity[robot] = self._node.create_publisher(Twist, topic, 1)
+            self._velocity[robot] = self._node.create_publisher(Twist, f"{self._names[robot]}/cmd_vel", 1)
         message = Twist()
         message.linear.x = ways[0] * self._parameters.teleop_speed
         message.angular.z = ways[1] * self._parameters.teleop_turn_rate
@@ -156,15 +141,11 @@ class RobotCommands:
 
 def numbers(values: object, count: int) -> list[float] | None:
     """The given number of finite numbers from a page; None if invalid."""
-    if not isinstance(values, list) or len(values) != count:
-        return None
-    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in values):
-        return None
-    try:
-        found = [float(one) for one in values]
-    except OverflowError:  # a whole number of more than 308 digits
-        return None
-    return found if all(map(math.isfinite, found)) else None
+    found: list[float] = []
+    if isinstance(values, list) and all(type(one) in (int, float) for one in values):
+        with suppress(OverflowError):  # a whole number of more than 308 digits
+            found = [float(one) for one in values]
+    return found if len(found) == count and all(map(math.isfinite, found)) else None
 
 
 _OLD_NS = 500_000_000
@@ -208,27 +189,24 @@ class Places:
         """All places, of the messages received by now; None if none has changed since the last call."""
         for robot, subscription in self._subscriptions.items():
             taken = subscription.handle.take_message(PoseStamped, True)
-            if taken is not None:
-                self._take(robot, taken[0])
+            if taken is None:
+                continue
+            try:
+                message = decode_pose_stamped(taken[0])
+            except CdrError:
+                self._drop("malformed")
+                continue
+            if np.isfinite(message.pose).all():
+                self._newest[robot] = (message.stamp_ns, message.pose)
+            else:
+                self._drop("not_finite")
         newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
         if newest_ns == self._sent_ns:
             return None
         self._sent_ns = newest_ns
         limit_ns = 0 if self._keeps else newest_ns - _OLD_NS
         shown = {robot: pose for robot, (at_ns, pose) in self._newest.items() if at_ns >= limit_ns}
-        return places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
-
-    def _take(self, robot: int, data: bytes) -> None:
-        """Store a serialized PoseStamped of a robot."""
-        try:
-            message = decode_pose_stamped(data)
-        except CdrError:
-            self._drop("malformed")
-            return
-        if np.isfinite(message.pose).all():
-            self._newest[robot] = (message.stamp_ns, message.pose)
-        else:
-            self._drop("not_finite")
+        return page.places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
 
     def clear(self) -> None:
         """Clear all places."""
@@ -241,9 +219,9 @@ class AerialNames:
 
     def __init__(self, index_of: dict[str, int]) -> None:
         self._index_of = index_of
-        self._images: dict[int, AnonymousDetectionArray] = {}
+        self._images: dict[int, msg.AnonymousDetectionArray] = {}
 
-    def detections(self, message: AnonymousDetectionArray) -> Frame:
+    def detections(self, message: msg.AnonymousDetectionArray) -> Frame:
         """The frame of an image without identities."""
         stamp_ns = nanoseconds(message.header.stamp)
         self._images[stamp_ns] = message
@@ -251,14 +229,14 @@ class AerialNames:
             del self._images[next(iter(self._images))]
         return self._frame(stamp_ns, ())
 
-    def identities(self, message: RobotIdentities) -> Frame | None:
+    def identities(self, message: msg.RobotIdentities) -> Frame | None:
         """The frame of one of the newest images with identities; None for an older image."""
         stamp_ns = nanoseconds(message.header.stamp)
         if stamp_ns not in self._images:
             return None
         return self._frame(stamp_ns, message.identities)
 
-    def _frame(self, stamp_ns: int, identities: Iterable[RobotIdentity]) -> Frame:
+    def _frame(self, stamp_ns: int, identities: Iterable[msg.RobotIdentity]) -> Frame:
         seen = self._images[stamp_ns].detections
         position = np.array([(one.x, one.y) for one in seen]).reshape(-1, 2)
         robot, probability = np.full(len(seen), -1), np.zeros(len(seen))
@@ -266,7 +244,7 @@ class AerialNames:
             if 0 <= one.detection < len(seen) and one.name in self._index_of:
                 robot[one.detection] = self._index_of[one.name]
                 probability[one.detection] = one.probability
-        return aerial_frame(stamp_ns, position, robot, probability)
+        return page.aerial_frame(stamp_ns, position, robot, probability)
 
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -293,22 +271,21 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._sightings: Subscription | None = None
         self._places: list[Places] = []
         for kind, topic in (("truth", "ground_truth"), ("goals", "goal")):
-            topics, drop = (
-                [f"{name}/{topic}" for name in self._names],
-                partial(self._drop, f"<robot>/{topic}"),
-            )
+            topics = [f"{name}/{topic}" for name in self._names]
+            drop = partial(self._drop, f"<robot>/{topic}")
             self._places.append(Places(self, kind, topics, drop, keeps=kind == "goals"))
         self._commands = RobotCommands(self, self._names, self.params, time.monotonic_ns)
         title = self.params.title or path.resolve().parent.name
-        first = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
+        first = page.about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
         access = Access(self.params.address, self.params.token)
         self.server = WatchServer(first, access, self.params.port, self.params.rate, self._commands.order)
         raw: Callable[..., Subscription] = partial(self.create_subscription, raw=True)
-        raw(SwarmPoses, "swarm/poses", self._on_poses, _FLEETING)
+        raw(msg.SwarmPoses, "swarm/poses", self._on_poses, _FLEETING)
         raw(DiagnosticArray, "/diagnostics", self._on_diagnostics, _FLEETING)
-        read, aerial, show = self.create_subscription, self._aerial, self._publish
-        read(AnonymousDetectionArray, "aerial/detections", lambda m: show(aerial.detections(m)), _FLEETING)
-        read(RobotIdentities, "aerial/identities", lambda m: show(aerial.identities(m)), _FLEETING)
+        hear, aerial, show = self.create_subscription, self._aerial, self._publish
+        image = msg.AnonymousDetectionArray
+        hear(image, "aerial/detections", lambda m: show(aerial.detections(m)), _FLEETING)
+        hear(msg.RobotIdentities, "aerial/identities", lambda m: show(aerial.identities(m)), _FLEETING)
         follow = SubscriptionEventCallbacks(incompatible_qos=self._follow_map)
         self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
         self.create_steady_timer(_WORK_S, self._commands.work)
@@ -354,7 +331,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
                 places.clear()
         self._newest_ns = estimate.stamp_ns
         self._heard_s = time.monotonic()
-        self.server.publish(poses_frame(estimate))
+        self.server.publish(page.poses_frame(estimate))
         if self._heard_s > self._places_s + _PLACES_PERIOD_S:
             self._places_s = self._heard_s
             for places in self._places:
@@ -362,13 +339,13 @@ class WatchNode(ConfiguredNode[WatchParameters]):
 
     def _on_sightings(self, data: bytes) -> None:
         try:
-            self.server.publish(sightings_frame(*decode_sightings(data)))
+            self.server.publish(page.sightings_frame(*decode_sightings(data)))
         except CdrError:
             self._drop("swarm/sightings", "malformed")
 
     def _on_map(self, data: bytes) -> None:
         try:
-            self.server.publish(map_frame(self._newest_ns, decode_occupancy_grid(data)))
+            self.server.publish(page.map_frame(self._newest_ns, decode_occupancy_grid(data)))
         except CdrError:
             self._drop("map", "malformed")
 
@@ -383,8 +360,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             if robot is not None:
                 values = {pair.key: pair.value for pair in status.values}
                 report = {"robot": robot, "message": status.message, "values": values}
-                stamp_ms = self._newest_ns * 1e-6
-                self.server.send_text({"kind": "report", "stamp": stamp_ms, **report}, robot)
+                self.server.send_text({"kind": "report", "stamp": self._newest_ns * 1e-6, **report}, robot)
 
     def _look_around(self) -> None:
         """Subscribe to published topics, and to sightings while a page is open; report missing ones."""
@@ -392,9 +368,8 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         for places in self._places:
             places.look_for_publishers(published)
         if self.server.has_viewers and self._sightings is None:
-            self._sightings = self.create_subscription(
-                SwarmSightings, "swarm/sightings", self._on_sightings, _FLEETING, raw=True
-            )
+            create = partial(self.create_subscription, msg.SwarmSightings, "swarm/sightings", raw=True)
+            self._sightings = create(self._on_sightings, _FLEETING)
         elif not self.server.has_viewers and self._sightings is not None:
             self.destroy_subscription(self._sightings)
             self._sightings = None
@@ -423,7 +398,6 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self.publish_reports(Report(self.get_name(), message, level_of(said), values))
 
     def _drop(self, topic: str, reason: str) -> None:
-        """Count a dropped message."""
         self.health.drop(f"{topic} {reason}")
 
 

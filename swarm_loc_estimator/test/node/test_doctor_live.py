@@ -1,7 +1,5 @@
 """The doctor over DDS: it hears the topics of a live graph, and knows their publishers."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

@@ -1,8 +1,7 @@
-"""Infrared matrices and absolute fixes over DDS: robots without odometry are located, faults are named."""
-
-from __future__ import annotations
+"""Inputs of the estimator's node: aerial images, ranges, fixed cameras and the local frame."""
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,54 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_world import SECOND, T0_NS, Ros, newest_status, odometry_bytes, overrides, stamp_ns, values_of
+from node_world import (
+    LANDMARKS,
+    SECOND,
+    SETTINGS,
+    STEP_NS,
+    T0_NS,
+    TRUE_POSES,
+    Robots,
+    Ros,
+    detection_bytes,
+    newest_status,
+    odometry_bytes,
+    overrides,
+    sight,
+    stamp_ns,
+    values_of,
+)
+from node_world import SWARM_YAML as SWARM_YAML_LOCAL_FRAME_NODE
+from node_world import xytheta as xytheta_local_frame_node
+from rcl_interfaces.msg import Log
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Range as PairRange
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.common.messages.detections import encode_brightness
+from swarm_loc_estimator.common.messages.detections import (
+    ANONYMOUS_DTYPE,
+    DETECTION_DTYPE,
+    encode_brightness,
+    encode_detections,
+)
 from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.swarm.ir_board import load_ir_platform
-from swarm_loc_msgs.msg import BrightnessMatrix, SwarmPose, SwarmPoses
+from swarm_loc_msgs.msg import (
+    AnonymousDetectionArray,
+    BrightnessMatrix,
+    MarkerDetectionArray,
+    Range,
+    RangeArray,
+    RobotIdentities,
+    SwarmPose,
+    SwarmPoses,
+)
 
 SWARM_YAML = """
 fileversion: 1
@@ -141,3 +177,238 @@ def test_light_of_strangers_and_fixes_in_a_foreign_frame_are_dropped_and_named(
     status, _ = report(heard, "estimator: gamma")
     assert status.message == "gamma/fix is in frame 'world' but must be in 'map'"
     assert droplets.newest("beta").status == droplets.newest("gamma").status == SwarmPose.STATUS_WAITING
+
+
+def image(frame: str, at_ns: int) -> bytes:
+    """Beta, alpha and a stranger."""
+    shown = np.zeros(3, dtype=ANONYMOUS_DTYPE)
+    shown["x"], shown["y"] = np.array([TRUE_POSES["beta"], TRUE_POSES["alpha"], (5.0, 5.0, 0.0)]).T[:2]
+    shown["theta"] = np.nan
+    shown["covariance"][:, 0, 0] = -1.0
+    return encode_detections(frame, at_ns, shown)
+
+
+def test_robots_seen_from_above_are_told_apart_and_a_wrong_frame_is_named(ros: Ros, robots: Robots) -> None:
+    identities = ros.listen(RobotIdentities, "aerial/identities")
+    reports = ros.listen(DiagnosticArray, "/diagnostics")
+    camera = ros.tester.create_publisher(AnonymousDetectionArray, "aerial/detections", 10)
+    ros.until(lambda: camera.get_subscription_count() and ros.tester.count_publishers("aerial/identities"))
+    seen_ns = robots.run(T0_NS, 20)
+    camera.publish(image("map", seen_ns))
+    now_ns = robots.run(seen_ns + STEP_NS, 4)
+    ros.until(lambda: identities)
+    newest = identities[-1]
+    assert (newest.header.frame_id, stamp_ns(newest)) == ("map", seen_ns)
+    assert [(one.name, one.detection) for one in newest.identities] == [("alpha", 1), ("beta", 0)]
+    assert all(one.probability > 0.99 for one in newest.identities)
+
+    camera.publish(image("table", now_ns))
+    last_ns = robots.run(now_ns + STEP_NS, 4)
+    ros.until(lambda: reports and stamp_ns(reports[-1]) >= last_ns)
+    status = newest_status(reports, "estimator")
+    values = values_of(status)
+    assert values["dropped: aerial_frame"] == "1"
+    assert values["dropped: aerial_unassigned"] == "1"
+    assert values["aerial/detections received"] == "2"
+    assert "aerial/detections is in frame 'table' but must be in 'map'" in status.message
+    assert values_of(newest_status(reports, "estimator: alpha"))["aerial detection"] == "1"
+
+
+SWARM = """
+fileversion: 1
+robots:
+  alpha: {camera: null, faces: {top: {z: 0.1, yaw: 0.0, size: 0.05, lies: true}}, ids: {top: 4}}
+cameras:
+  ceiling1: {x: 1.0, y: 0.5, z: 2.1}
+  ceiling2: {x: 3.0, y: 0.5, z: 2.1}
+"""
+STEP_NS_FIXED_CAMERAS_NODE = SECOND // 10
+
+
+def below(marker_id: int) -> Any:
+    """A marker 2 m under the camera whose right points to the top of the image, to map's x."""
+    one = np.zeros(1, DETECTION_DTYPE)
+    one["id"], one["content"], one["position"] = marker_id, 2, (-0.2, 0.0, 2.0)
+    half = math.sqrt(0.5)
+    one["orientation"] = (half, -half, 0.0, 0.0)  # its x is up in the image, its z towards the camera
+    one["covariance"] = np.diag([1e-8, 1e-8, 1e-4, 1e-3, 1e-3, 1e-5])
+    return one
+
+
+@pytest.fixture
+def estimator(ros: Ros, tmp_path: Path) -> EstimatorNode:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(SWARM, encoding="utf-8")
+    given = overrides(swarm_file=str(path), use_sim_time=True, **SETTINGS)
+    node: EstimatorNode = ros.add(EstimatorNode(parameter_overrides=given))
+    return node
+
+
+def test_detections_of_a_fixed_camera_locate_a_robot(ros: Ros, estimator: EstimatorNode) -> None:
+    tester = ros.tester
+    clock = tester.create_publisher(Clock, "/clock", 10)
+    odometry = tester.create_publisher(Odometry, "alpha/odom", 100)
+    detections = tester.create_publisher(MarkerDetectionArray, "ceiling1/detections", 100)
+    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+    diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+    publishers = (clock, odometry, detections)
+    ros.until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
+    ros.until(lambda: tester.count_publishers("swarm/poses") and tester.count_publishers("/diagnostics"))
+    (topic,) = tester.get_subscriptions_info_by_topic("/ceiling2/detections")
+    assert topic.node_name == estimator.get_name()
+
+    def step(now_ns: int) -> None:
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        for marker_id in (4, 99):
+            detections.publish(detection_bytes("ceiling1", now_ns, below(marker_id)))
+        ros.until(lambda: any(stamp_ns(one) == now_ns for one in poses))
+
+    for k in range(30):
+        step(T0_NS + k * STEP_NS_FIXED_CAMERAS_NODE)
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((1.0, 0.7, 0.0), abs=2e-3)
+    ros.until(lambda: "dropped: unknown_id" in values_of(newest_status(diagnostics, "estimator: ceiling1")))
+    assert newest_status(diagnostics, "estimator: ceiling1").message == "seeing"
+    missing = newest_status(diagnostics, "estimator: ceiling2").message
+    assert missing.startswith("no messages received on ceiling2/detections")
+
+
+def test_poses_without_a_map_are_in_a_frame_of_a_robot_until_landmarks_come(
+    ros: Ros, swarm_file: Path
+) -> None:
+    swarm_file.write_text(
+        SWARM_YAML_LOCAL_FRAME_NODE.replace(", start: {x: 0.0, y: 0.0, theta: 0.0}", ""), encoding="utf-8"
+    )
+    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, origin_after_s=0.5, **SETTINGS)
+    ros.add(EstimatorNode(parameter_overrides=parameters))
+    robots, alpha, beta = Robots(ros), (1.0, 1.0, np.pi), (0.0, 1.0, 0.0)
+    robots.wait_for_estimator()
+    transforms, log = ros.listen(TFMessage, "/tf"), ros.listen(Log, "/rosout")
+    ros.until(lambda: ros.tester.count_publishers("/tf"))
+    now_ns = T0_NS
+
+    def step(ids: tuple[int, ...]) -> int:
+        nonlocal now_ns
+        now_ns, heard = now_ns + STEP_NS, len(robots.poses)
+        robots.tell_time(now_ns)
+        robots.odometry("alpha", odometry_bytes("alpha", now_ns))
+        robots.odometry("beta", odometry_bytes("beta", now_ns))
+        seen = sight(alpha, ids, {2: beta, **LANDMARKS})
+        robots.detections("alpha", detection_bytes("alpha", now_ns, seen))
+        ros.until(lambda: any(stamp_ns(pose) == now_ns for pose in robots.poses[heard:]))
+        return now_ns
+
+    while robots.poses[-1:] == [] or robots.poses[-1].header.frame_id == "map":
+        assert step((2,)) < T0_NS + 20 * SECOND
+    frame = robots.poses[-1].header.frame_id
+    assert frame in {"alpha/start", "beta/start"}
+    while not robots.located("beta"):
+        assert step((2,)) < T0_NS + 20 * SECOND
+    ros.until(lambda: transforms and stamp_ns(transforms[-1].transforms[0]) == now_ns)
+    assert {one.header.frame_id for one in transforms[-1].transforms} == {frame}
+    ros.until(lambda: any(f"poses are relative to {frame[:-6]}, in '{frame}'" in one.msg for one in log))
+    while robots.poses[-1].header.frame_id != "map":
+        assert step((2, *LANDMARKS)) < T0_NS + 40 * SECOND
+    assert xytheta_local_frame_node(robots.newest("beta")) == pytest.approx(beta, abs=0.1)
+    ros.until(lambda: any(f"poses are in 'map' now, no longer in '{frame}'" in one.msg for one in log))
+
+
+ANCHORS = {16: (-3.0, -3.0), 17: (3.0, -3.0), 18: (0.0, 3.0)}
+SWARM_YAML_RANGES_LIVE = """
+fileversion: 1
+robots:
+  alpha:
+    camera: null
+    uwb: {address: 1, range_sigma: 0.02}
+    start: {x: 0.1, y: -0.1, theta: 0.0}
+    start_sigma: {x: 0.2, y: 0.2}
+anchors:
+""" + "".join(
+    f"  - {{address: {a}, x: {x}, y: {y}, z: 1.0, range_bias_sigma: 0.0}}\n" for a, (x, y) in ANCHORS.items()
+)
+
+
+def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
+    """Whether an estimate at an instant has come after some."""
+    return any(stamp_ns(one) == now_ns for one in poses[before:])
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [
+        {"odom": "alpha/odom", "ranges": "alpha/ranges"},
+        {"odom": "lab/alpha/odometry/filtered", "ranges": "radios/first"},
+    ],
+)
+def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]) -> None:
+    """Topics have the expected names, or those of the description."""
+    path = tmp_path / "swarm.yaml"
+    of_others = "topics: {<robot>/odom: lab/<robot>/odometry/filtered, alpha/ranges: /radios/first}"
+    named = "" if topics["ranges"] == "alpha/ranges" else of_others
+    path.write_text(f"{SWARM_YAML_RANGES_LIVE}{named}\n", encoding="utf-8")
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, topics["odom"], 100)
+    ranges = ros.tester.create_publisher(RangeArray, topics["ranges"], 100)
+    poses = ros.listen(SwarmPoses, "swarm/poses")
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, ranges)))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    measured = [Range(device=a, range=float(np.hypot(np.hypot(x, y), 1.0))) for a, (x, y) in ANCHORS.items()]
+    for step in range(8):
+        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
+        ranges.publish(RangeArray(header=header, ranges=[*measured, Range(device=99, range=1.0)]))
+        ros.until(partial(is_estimated, poses, before, now_ns))
+    ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
+
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    assert values_of(newest_status(heard, "estimator: alpha"))["ranges received"] == "8"
+    assert values_of(newest_status(heard, "estimator"))["dropped: uwb_unknown_address"] == "8"
+
+
+def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> None:
+    """The topics have names of radios, in both orders, as the drivers of tags and of anchors publish them."""
+    path = tmp_path / "swarm.yaml"
+    named = SWARM_YAML_RANGES_LIVE.replace("{address: 1,", "{address: 1, name: tag,").replace(
+        "address: 16,", "address: 16, name: west,"
+    )
+    path.write_text(f"{named}range_topic: /uwb/n_{{from}}/n_{{to}}/distance\n", encoding="utf-8")
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    names = {16: "uwb/n_tag/n_west/distance", 17: "uwb/n_17/n_tag/distance", 18: "uwb/n_tag/n_18/distance"}
+    ranges = {a: ros.tester.create_publisher(PairRange, name, 10) for a, name in names.items()}
+    poses = ros.listen(SwarmPoses, "swarm/poses")
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, *ranges.values())))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    for step in range(8):
+        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
+        for a, (x, y) in ANCHORS.items():
+            ranges[a].publish(PairRange(header=header, range=float(np.hypot(np.hypot(x, y), 1.0))))
+        ros.until(partial(is_estimated, poses, before, now_ns))
+    ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
+
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    assert values_of(newest_status(heard, "estimator: alpha"))["measurements used"] == "24"
+
+
+@pytest.mark.usefixtures("ros")
+def test_a_topic_that_ros_refuses_is_a_mistake_of_the_user(tmp_path: Path) -> None:
+    """Tokens of topics must not begin with a digit."""
+    path = tmp_path / "swarm.yaml"
+    path.write_text(f"{SWARM_YAML_RANGES_LIVE}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
+    with pytest.raises(InvalidTopicNameException, match="must not start with a number"):
+        EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True))

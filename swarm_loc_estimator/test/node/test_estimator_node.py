@@ -1,7 +1,6 @@
 """The estimator node over DDS: what comes in leads to what comes out."""
 
-from __future__ import annotations
-
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from node_world import (
+    PATIENCE_S,
     SETTINGS,
     STEP_NS,
     T0_NS,
@@ -201,6 +201,30 @@ def test_services_reset_seat_and_forget(ros: Ros, robots: Robots) -> None:
     assert ros.call(Trigger, "estimator/reset", Trigger.Request()).success
     robots.step(now_ns + STEP_NS)
     assert robots.newest("alpha").x == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_description_is_fitted_beside_the_ticks(ros: Ros, robots: Robots, swarm_file: Path) -> None:
+    """Robots that stand for a few seconds tell too little, so nothing is written."""
+    said: list[str] = []
+
+    def ask() -> str:
+        response = ros.call(Trigger, "estimator/refine", Trigger.Request())
+        assert not response.success
+        said.append(response.message)
+        return said[-1]
+
+    assert ask() == "Nothing is refined: no message was received yet."
+    now_ns = robots.run(T0_NS, 4)
+    assert "are being fitted; ask again for what they give." in ask()
+    end_s = time.monotonic() + 5.0 * PATIENCE_S
+    while "ask again" in said[-1]:
+        assert time.monotonic() < end_s
+        count = len(robots.poses)
+        now_ns = robots.run(now_ns + STEP_NS, 4)
+        assert len(robots.poses) > count
+        ask()
+    assert said[-1].startswith(f"Nothing is refined: recording '{swarm_file.name}' holds ")
+    assert [one.name for one in swarm_file.parent.iterdir()] == [swarm_file.name]
 
 
 def test_a_seat_that_cannot_be_taken_is_refused_in_a_sentence(ros: Ros, robots: Robots) -> None:

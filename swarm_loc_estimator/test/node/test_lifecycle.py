@@ -1,7 +1,5 @@
 """The estimator as a managed node: its transitions by a client, and a signal in each of its states."""
 
-from __future__ import annotations
-
 import gc
 import signal
 from contextlib import suppress

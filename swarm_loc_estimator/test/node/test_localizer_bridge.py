@@ -1,7 +1,5 @@
 """The bridge over DDS: poses of bodies come out as fixes and truth of robots, and what is missing is told."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any

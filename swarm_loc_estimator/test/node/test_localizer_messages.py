@@ -1,7 +1,5 @@
 """The bridge over DDS with messages of motion_capture_tracking, built here where they are not installed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

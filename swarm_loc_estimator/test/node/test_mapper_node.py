@@ -1,7 +1,5 @@
 """The mapper over DDS: a robot in a small room, a map that late subscribers get, goals, fixes, files."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from functools import partial

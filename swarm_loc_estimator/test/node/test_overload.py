@@ -1,7 +1,5 @@
 """More comes over DDS than an estimator can use: it leaves sightings out, says so, and stays right."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,6 +1,4 @@
-"""The player as a process: everything that the bag holds arrives, once and in order."""
-
-from __future__ import annotations
+"""The player: what it publishes, and with which quality of service."""
 
 import signal
 from pathlib import Path
@@ -8,11 +6,14 @@ from pathlib import Path
 import pytest
 from nav_msgs.msg import Odometry
 from node_world import SECOND, STEP_NS, T0_NS, Program, Ros, detection_bytes, odometry_bytes, sight
-from rclpy.qos import QoSProfile
+from rclpy.duration import Duration, Infinite
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
+from rosbags.interfaces import QosDurability, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter, typestore
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
@@ -152,3 +153,43 @@ def test_a_player_that_is_stopped_does_not_wait_for_one_who_does_not_listen(
             assert player.end() == 0
     assert times
     assert took_s < 2.0
+
+
+BEST_EFFORT = RELIABLE._replace(reliability=QosReliability.BEST_EFFORT, deadline=QosTime(0, 500_000_000))
+LATCHED = RELIABLE._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)
+VAGUE = RELIABLE._replace(reliability=QosReliability.SYSTEM_DEFAULT, durability=QosDurability.BEST_AVAILABLE)
+TOPICS = {
+    "best_effort": [BEST_EFFORT, BEST_EFFORT],
+    "latched": [LATCHED],
+    "vague": [VAGUE],
+    "different": [RELIABLE, BEST_EFFORT],
+    "unknown": [],
+    "tf_static": [],
+}
+
+
+def _bag(path: Path) -> Path:
+    """One message of each topic."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for name, profiles in TOPICS.items():
+            topic = writer.add_connection(
+                f"/{name}", ODOMETRY, typestore=typestore(), offered_qos_profiles=profiles
+            )
+            writer.write(topic, T0_NS, odometry_bytes(name, T0_NS))
+    return path
+
+
+def test_topics_offer_what_was_recorded_and_else_what_all_can_hear(ros: Ros, tmp_path: Path) -> None:
+    parameters = {"bag": _bag(tmp_path / "bag"), "wait_for_subscribers": len(TOPICS)}
+    with Program("play", tmp_path / "log", parameters):
+        ros.until(lambda: all(ros.tester.count_publishers(name) for name in TOPICS))
+        offered: dict[str, QoSProfile] = {
+            name: ros.tester.get_publishers_info_by_topic(name)[0].qos_profile for name in TOPICS
+        }
+
+    unreliable = [name for name, qos in offered.items() if qos.reliability == ReliabilityPolicy.BEST_EFFORT]
+    latched = [name for name, qos in offered.items() if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL]
+    assert unreliable == ["best_effort"]
+    assert latched == ["latched", "tf_static"]
+    assert offered["best_effort"].deadline == Duration(nanoseconds=500_000_000)
+    assert offered["latched"].deadline == offered["unknown"].deadline == Infinite

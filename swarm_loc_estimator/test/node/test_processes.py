@@ -3,8 +3,6 @@
 All processes share one output pipe, so its end says that none of them is left.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,28 +1,34 @@
-"""Publishers as they come: best effort, more of them than should be, of another type; and other clocks."""
+"""What nodes publish: attributes, publishers and shared topics."""
 
-from __future__ import annotations
-
+import ast
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from node_world import (
     PATIENCE_S,
+    SETTINGS,
     STEP_NS,
     T0_NS,
+    TRUE_POSES,
     Program,
     Robots,
     Ros,
     newest_status,
     odometry_bytes,
     overrides,
+    sight,
+    stamp_ns,
     values_of,
 )
 from rcl_interfaces.msg import Log, ParameterType
@@ -30,10 +36,15 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
+from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_msgs.msg import SwarmDetections, SwarmOdometry, SwarmPoses
+from workspace.layout import PACKAGES, ROOT
 
 FLOOD = """
 import sys
@@ -182,3 +193,99 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
 def resident_bytes(pid: int) -> int:
     """Memory of a process."""
     return int(Path("/proc", str(pid), "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+FILES = [path for package in PACKAGES for path in sorted(ROOT.glob(f"{package}/{package}/**/*.py"))]
+
+
+@pytest.fixture
+def taken() -> Iterator[frozenset[str]]:
+    """The names of all that a bare node has."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = Node("bare", context=context)
+    yield frozenset(dir(node))
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def _own_attributes(source: str) -> set[str]:
+    """What the classes that derive from Node, or from others that are called nodes, assign to themselves."""
+    classes = [
+        found
+        for found in ast.walk(ast.parse(source))
+        if isinstance(found, ast.ClassDef)
+        and any(ast.unparse(base).partition("[")[0].endswith("Node") for base in found.bases)
+    ]
+    stored = [
+        ast.unparse(part)
+        for found in classes
+        for part in ast.walk(found)
+        if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store)
+    ]
+    return {name.removeprefix("self.") for name in stored if name.startswith("self.")}
+
+
+def test_no_attribute_of_rclpy_is_replaced(taken: frozenset[str]) -> None:
+    own = {str(path): _own_attributes(path.read_text(encoding="utf-8")) for path in FILES}
+
+    assert any(own.values())
+    assert {name: names & taken for name, names in own.items() if names & taken} == {}
+
+
+KEY = swarm_key(TRUE_POSES)
+
+
+def head(robot: list[int], now_ns: int) -> SharedHead:
+    """Readings of now; two more of a robot that there is not are no obstacle."""
+    indices = np.array([*robot, 77])
+    return SharedHead(now_ns, "odom", KEY, indices, np.full(indices.size, now_ns))
+
+
+def test_robots_are_located_by_topics_that_they_share(ros: Ros, swarm_file: Path) -> None:
+    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, shared_topics=True, **SETTINGS)
+    node = ros.add(EstimatorNode(parameter_overrides=parameters))
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = [ros.tester.create_publisher(SwarmOdometry, "swarm/odom", 10) for _ in TRUE_POSES]
+    seen = ros.tester.create_publisher(SwarmDetections, "swarm/detections", 10)
+    ros.until(lambda: all(one.get_subscription_count() for one in (clock, *odometry, seen)))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    for step in range(30):
+        now_ns = T0_NS + step * STEP_NS
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        for robot, gateway in enumerate(odometry):
+            gateway.publish(encode_shared_numbers(head([robot], now_ns), np.zeros((2, 3))))
+        images = [sight(pose) for pose in TRUE_POSES.values()]
+        robots = np.repeat(range(len(images)), [len(image) for image in images]).tolist()
+        markers = np.concatenate([*images, images[0][:1]], dtype=images[0].dtype)
+        seen.publish(encode_shared_detections(head(robots, now_ns), markers))
+        ros.until(lambda now_ns=now_ns: bool(poses) and stamp_ns(poses[-1]) == now_ns)  # type: ignore[misc]
+    for pose in poses[-1].robots:
+        assert (pose.x, pose.y, pose.theta) == pytest.approx(TRUE_POSES[pose.name], abs=0.02)
+        assert pose.status == pose.STATUS_TRACKED
+
+    def is_well() -> bool:
+        """Whether diagnostics of the last poses find nothing wrong; ticks may have taken all of the time."""
+        told = bool(heard) and stamp_ns(heard[-1]) == now_ns
+        return told and newest_status(heard, "estimator").level == DiagnosticStatus.OK
+
+    ros.until(is_well)
+    values = values_of(newest_status(heard, "estimator"))
+    assert values["swarm/odom received"] == "60"
+    assert values["swarm/detections received"] == "30"
+    assert values["dropped: unknown_robot"] == "90"
+    names = {name for name, _ in node.get_subscriber_names_and_types_by_node("estimator", "/")}
+    assert not [name for name in names if name.startswith(("/alpha/", "/beta/"))]
+
+
+def test_what_is_missing_is_named_by_the_shared_topic(ros: Ros, swarm_file: Path) -> None:
+    parameters = overrides(swarm_file=str(swarm_file), shared_topics=True)
+    ros.add(EstimatorNode(parameter_overrides=parameters))
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+
+    def sentence() -> str:
+        return " ".join(one.message for one in heard[-1].status if one.name == "estimator") if heard else ""
+
+    ros.until(lambda: "no messages received on swarm/odom, swarm/detections (no publisher)" in sentence())

@@ -1,7 +1,5 @@
 """Scans of a lidar over DDS: the estimator takes them and corrects a start by the map of the description."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -4,8 +4,6 @@ Multicast does not pass the router, so nodes find each other only through the di
 there can be no namespaces.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

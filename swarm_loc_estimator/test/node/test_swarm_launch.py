@@ -1,7 +1,5 @@
 """The launch file starts the list of the `graph` command, or says why not and ends with an error."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

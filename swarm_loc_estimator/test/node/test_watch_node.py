@@ -1,7 +1,5 @@
 """The page's node and the markers' node beside a real estimator, over DDS."""
 
-from __future__ import annotations
-
 import json
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Swarms are localized by anonymous detections from above, in any order of arrival."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

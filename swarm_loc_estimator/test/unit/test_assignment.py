@@ -1,7 +1,5 @@
 """Global assignment of anonymous detections to robots, and what the camera sees."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -9,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.identification.assignment import AMBIGUOUS, UNSEEN, assign, log_ratios
 from swarm_loc_estimator.identification.memory import IdentityMemory, convex_hull
-from swarm_loc_estimator.identification.picture import Picture
+from swarm_loc_estimator.identification.picture import AMBIGUOUS, UNSEEN, Picture, assign, log_ratios
 
 SIGMA, GATE = 0.02, 18.4
 

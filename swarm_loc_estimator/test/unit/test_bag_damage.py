@@ -1,7 +1,5 @@
 """Bags that a disk, a crash or somebody with bad intentions has changed: nothing is lost without a word."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import struct

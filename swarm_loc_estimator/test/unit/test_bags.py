@@ -1,10 +1,9 @@
 """Bags: every storage and compression in order of log time, whole, cut off anywhere, or damaged."""
 
-from __future__ import annotations
-
 import tracemalloc
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +19,6 @@ from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic
 from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter, typestore
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 TOPICS = {"a/odom": ODOMETRY, "b/detections": DETECTIONS}
 START = 1_700_000_000_000_000_000

@@ -1,7 +1,5 @@
 """Fits recover the models that a recording was made with, and refuse what holds nothing to fit to."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,18 +19,12 @@ from swarm_loc_estimator.offline.calibration.fit import (
     TICK_S,
     Score,
     calibrate,
+    refined,
     score,
     thinned,
 )
 from swarm_loc_estimator.offline.calibration.models import Options, fit_models, with_noise
-from swarm_loc_estimator.offline.calibration.motion import (
-    Drive,
-    Lateness,
-    fit_response,
-    nodes_of,
-    steps_of,
-    true_motion,
-)
+from swarm_loc_estimator.offline.calibration.motion import Lateness, drive_of, fit_response, nodes_of
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     Recording,
@@ -41,7 +33,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.robust import population, ridge
+from swarm_loc_estimator.offline.calibration.sightings import population, ridge
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
@@ -314,9 +306,7 @@ def test_a_table_has_to_earn_its_numbers(seed: int) -> None:
     for true, least, most in ((HONEST, 1, 1), (TRUE, 2, 6)):
         slipping = replace(true, odometry=OdometryModel())
         recording, swarm = record(World((robot(1, slipping),), seed, duration_s=150.0, turn_sigma=0.02))
-        track, truth = recording.track(0), recording.truth["robot1"]
-        motion = true_motion(truth, int(track.stamp_ns[0]), int(track.stamp_ns[-1]))
-        drive = Drive(steps_of(track, swarm.robots[0].odometry), motion)
+        drive = drive_of(recording.track(0), swarm.robots[0].odometry, recording.truth["robot1"])
         assert least <= len(fit_response([drive], late, table=True).speeds) <= most
 
 
@@ -427,14 +417,15 @@ def test_radios_and_gyroscopes_are_fitted_with_the_cameras(seed: int) -> None:
 def test_a_part_of_a_recording_is_a_part_of_all_its_inputs() -> None:
     recording, swarm = record(World((robot(1, HONEST),), 1, 60.0))
     recording, _ = with_radios_and_gyroscopes(recording, swarm, 1)
-    part = recording.between(21 * SECOND, 41 * SECOND)
+    part = recording.between((21 * SECOND, 41 * SECOND))
     for name in ("odometry", "detections", "turn_rates", "ranges"):
         whole, some = getattr(recording, name).robot.size, getattr(part, name).robot.size
         assert 0.28 < some / whole < 0.4
         assert part.messages[name.replace("turn_rates", "imu")].robot.size == some
 
 
-def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> None:
+def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone(tmp_path: Path) -> None:
+    """As a live estimator proposes it."""
     skewed = replace(
         HONEST,
         odometry=OdometryModel(distance_scale=0.95, turn_scale=1.05),
@@ -444,9 +435,11 @@ def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> 
     (wrong,) = started_at_truth(swarm, recording).robots
     stiff = replace(wrong, odometry=OdometryModel(wheel_noise=2e-5))
     begin = replace(swarm, robots=(stiff,))
-    done = calibrate(replace(recording, truth={}), begin, Options(response=False, alone=True), quiet)
-    assert not done.warning  # the half that begins where nobody has described is fitted, too
-    before, after = (score([rerun(recording, one, TICK_S)]).position_rmse for one in (begin, done.swarm))
+    is_better, said = refined([recording.messages], begin, tmp_path / "swarm.yaml")
+    assert is_better  # the half that begins where nobody has described is fitted, too
+    found = load_swarm(tmp_path / "swarm.refined.yaml")
+    assert "which stays in use.\nCorrected for robot1: " in said
+    before, after = (score([rerun(recording, one, TICK_S)]).position_rmse for one in (begin, found))
     assert after < 0.3 * before
 
 

@@ -1,19 +1,22 @@
-"""Detections against an independent rendering of markers in three dimensions."""
+"""Sightings of cameras: from messages to measurements, and those of bearings alone."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_geometry import homogeneous, marker_frame, seen
+from core_geometry import homogeneous, marker_frame, nees, seen, wrapped
 from core_messages import POSE_TWO, POSITION, T0, detection, joined
+from core_run import on_time, play, settled, ticks
+from core_world import Plan, World, simulate
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
-from swarm_loc_estimator.filter.models import BEARING, CARTESIAN, POLAR
+from swarm_loc_estimator.filter.models import BEARING, CARTESIAN, MODELS, POLAR
 from swarm_loc_estimator.sensors.camera import (
     _FLOOR_M,
     _FLOOR_RAD,
@@ -25,6 +28,8 @@ from swarm_loc_estimator.sensors.camera import (
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 LEVEL = CameraMount(x=0.04, z=0.05)
 MOUNTS = [
@@ -212,3 +217,54 @@ def test_nothing_at_all_is_converted_to_nothing() -> None:
     empty = np.zeros(0, dtype=DETECTION_DTYPE)
     assert converted(empty, swarm())[0].size == 0
     assert converted(detection(7, marker_frame(0, 0, 1, 0)), Swarm((Robot("alone"),)))[1] == {"unknown_id": 1}
+
+
+POSITION_BEARING_SIGHTINGS = 1
+
+
+def errors(world: World, *, seeing: bool) -> tuple[FloatArray, FloatArray, dict[str, int]]:
+    """Errors (T, N, 3) and covariances (T, N, 3, 3) at whole seconds, and verdicts on measurements."""
+    estimator = Estimator(world.swarm, Settings())
+    events = []
+    for arrival_ns, event in on_time(world):
+        if event.detections.size:
+            event.detections["content"] = CONTENT_BEARING
+            event.detections["position"] *= 7.0  # its length means nothing
+        if seeing or not event.detections.size:
+            events.append((arrival_ns, event))
+    at_ns = ticks(int(world.stamp_ns[0]), int(world.stamp_ns[-1]), 1.0)[2:]
+    estimates = play(estimator, events, at_ns)
+    error = wrapped(np.array([one.poses - world.at(one.stamp_ns) for one in estimates]))
+    return error, np.array([one.covariances for one in estimates]), settled(estimator)
+
+
+def test_bearings_make_poses_better_and_the_errors_stay_as_large_as_the_covariances_say() -> None:
+    squared, seeing, blind = [], [], []
+    for seed in range(6):
+        plan = Plan(3, 8.0, content=POSITION_BEARING_SIGHTINGS)
+        error, covariance, verdicts = errors(simulate(plan, 300 + seed), seeing=True)
+        assert verdicts["USED"] > 100
+        squared.append(nees(error, covariance).mean(axis=0))
+        seeing.append(np.square(error).mean(axis=(0, 1)))
+        blind.append(np.square(errors(simulate(plan, 300 + seed), seeing=False)[0]).mean(axis=(0, 1)))
+    better = np.sqrt(np.mean(seeing, axis=0) / np.mean(blind, axis=0))
+    assert (better < 0.7).all()
+    few = len(squared) * len(squared[0])  # means over a run are correlated: each counts as one pose at least
+    assert chi2.ppf(0.001, 3 * few) / few < np.mean(squared) < chi2.ppf(0.999, 3 * few) / few
+
+
+def test_bearings_locate_a_robot_that_moves() -> None:
+    """Together with its motion, as other measurements of one degree of freedom."""
+    world = simulate(Plan(2, 8.0, content=POSITION_BEARING_SIGHTINGS, start_known=(False,)), 5)
+    error, _, verdicts = errors(world, seeing=True)
+    located = error[-1][np.isfinite(error[-1]).all(axis=1)]
+    assert len(located)
+    assert np.abs(located[:, :2]).max() < 0.3
+    assert verdicts["USED"] > 0
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_a_bearing_wraps(quarter: int) -> None:
+    value = np.array([0.5 * math.pi * quarter + 0.1, 0.0, 0.0])
+    predicted = np.array([0.5 * math.pi * quarter - 2.0 * math.pi])
+    assert MODELS[BEARING].innovation(value, predicted) == pytest.approx([0.1])

@@ -1,7 +1,5 @@
 """Reading and writing CDR agree with the type store of `rosbags`; what is not a whole message is refused."""
 
-from __future__ import annotations
-
 import math
 import struct
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The doctor names what is wrong in graphs that were good until one thing was changed, and is silent else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +19,8 @@ from wrong_setups import (
     with_topics,
 )
 
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli import doctor as command
-from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
@@ -113,12 +111,7 @@ def test_any_evidence_is_looked_at(change: Change) -> None:
 
 def test_a_whole_swarm_may_be_in_a_namespace(tmp_path: Path) -> None:
     bag, swarm = BAGS / "eight_five_robots", load_swarm(BAGS / "eight_five_robots" / "swarm.yaml")
-    with BagReader(bag) as reader, BagWriter(tmp_path / "bag") as writer:
-        for topic in reader.topics:
-            writer.add_topic(f"lab/{topic.name}", topic.type)
-        for name, _, log_ns, data in reader.messages():
-            if log_ns < reader.time_range_ns[0] + 5e9:
-                writer.write(f"lab/{name}", log_ns, data)
+    copy_part(bag, tmp_path / "bag", 5.0, rename=lambda name, kind: (f"lab/{name}", kind))
     for namespace, is_wrong in (("", True), ("lab", False), ("/lab/", False)):
         evidence = evidence_of_bag(tmp_path / "bag", swarm, 5.0, unwatched, namespace=namespace)
         assert bool(examine(evidence)) == is_wrong

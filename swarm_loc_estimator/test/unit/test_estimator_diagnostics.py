@@ -1,7 +1,5 @@
 """What /diagnostics says, from figures alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

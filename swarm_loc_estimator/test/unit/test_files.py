@@ -1,7 +1,5 @@
 """Outputs: whole or not at all, named where they cannot be written, and never through a link of others."""
 
-from __future__ import annotations
-
 import errno
 import os
 import select

@@ -1,7 +1,5 @@
 """Fixed cameras and lying markers: conversion against an independent composition in three dimensions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,6 +1,4 @@
-"""Fusion periods: what belongs to one, and when those of large and of small swarms are fused."""
-
-from __future__ import annotations
+"""When data are fused: in periods and parts, at the pace that the machine allows, or shed."""
 
 from dataclasses import replace
 
@@ -16,11 +14,12 @@ from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.nodes.load import MIN_SHARE, FusionPace, Shedding
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 from swarm_loc_estimator.timeline.timeline import Timeline, end_of_period, middle_of_period
 
@@ -140,3 +139,232 @@ def test_many_calibrated_robots_have_longer_periods_unless_one_is_given(
     swarm = Swarm(tuple(Robot(f"r{k}", odometry=kind) for k, kind in enumerate(kinds)), ())
     estimator = Estimator(swarm, Settings(fusion_period_s=given_s))
     assert estimator.settings.fusion_period_s == period_s
+
+
+TICK_NS = 50_000_000
+T0_NS = 1_000_000_000_000
+
+
+def _fusions(pace: FusionPace, cpu_s: float, ticks: int, rate: float = 1.0) -> list[int]:
+    """Ticks that fuse when each fusion takes `cpu_s` and bag time runs `rate` times as fast as the wall's."""
+    chosen = []
+    for tick in range(ticks):
+        now_ns = T0_NS + tick * TICK_NS
+        wall_s = tick * TICK_NS * 1e-9 / rate
+        if pace.is_due(wall_s, now_ns):
+            chosen.append(tick)
+            pace.begin(wall_s, now_ns)
+            pace.note(cpu_s)
+    return chosen
+
+
+@pytest.mark.parametrize(("cpu_s", "ticks_between"), [(0.001, 1), (0.009, 2), (0.016, 4)])
+def test_fusing_takes_its_share(cpu_s: float, ticks_between: int) -> None:
+    assert _fusions(FusionPace(0.1, 2.0), cpu_s, 41) == list(range(0, 41, ticks_between))
+
+
+@pytest.mark.parametrize("rate", [1.0, 10.0])
+def test_data_wait_for_a_quarter_of_the_horizon_at_most(rate: float) -> None:
+    assert _fusions(FusionPace(0.1, 2.0), 3.0, 41, rate) == [0, 10, 20, 30, 40]
+
+
+def test_time_that_jumps_back_is_not_waited_for() -> None:
+    pace = FusionPace(0.1, 2.0)
+    pace.begin(0.0, T0_NS)
+    pace.note(1.0)
+    assert not pace.is_due(0.05, T0_NS + TICK_NS)
+    assert pace.is_due(0.05, T0_NS - TICK_NS)
+
+
+def test_fusing_in_parts_rests_as_if_it_were_done_at_once() -> None:
+    pace = FusionPace(0.1, 2.0)
+    pace.begin(0.0, T0_NS)
+    for _ in range(4):
+        pace.note(0.005)
+    assert not pace.is_due(0.19, T0_NS + TICK_NS)
+    assert pace.is_due(0.21, T0_NS + TICK_NS)
+
+
+def test_it_tells_how_long_data_have_waited() -> None:
+    pace = FusionPace(0.1, 2.0)
+    assert pace.waited_s(T0_NS) == 0.0
+    pace.begin(0.0, T0_NS)
+    assert pace.waited_s(T0_NS + 4 * TICK_NS) == pytest.approx(0.2)
+    assert pace.waited_s(T0_NS - TICK_NS) == 0.0
+
+
+def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_ticks() -> None:
+    """Odometry changes what was measured, and until fusing ends this has grown too old."""
+    stepped: list[int] = []
+
+    def step(_state: SwarmState, rows: Measurements, *_: object) -> None:
+        stepped.extend(rows.stamp_ns.tolist())
+
+    state = SwarmState(ParameterTable.of((Robot("a"),), ()))
+    timeline = Timeline(Settings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
+    stamp_ns = T0 + PERIOD_NS * np.arange(1, 6, dtype=np.int64)
+    every = np.tile(np.eye(3), (stamp_ns.size, 1, 1))
+    timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, CARTESIAN))
+    timeline.advance(int(stamp_ns[-1]), lambda: False)
+    assert stepped == [stamp_ns[0]]
+    timeline.invalidate(np.array([T0]))
+    for k in range(10):
+        timeline.advance(int(stamp_ns[-1]) + k * SECOND, lambda: False)
+    assert not timeline.is_busy
+    assert stepped == 2 * stamp_ns.tolist()
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_odometry_is_there_for_all_that_is_left_to_fuse_however_long_that_takes(sparse: bool) -> None:
+    """Longer than odometry is kept otherwise."""
+    world, begin_ns = simulate(Plan(4, 18.0, 0.3), seed=1), T0 + 6 * SECOND
+    chosen = Settings(fusion_period_s=0.05, sparse_from=2 if sparse else 250)
+    sightings = [event for event in world.events if event.pose is None and event.stamp_ns <= begin_ns]
+    late_ns = begin_ns - round(chosen.horizon_s * 1e9)
+    arrivals = [(event.stamp_ns, event) for event in world.events if event.pose is not None]
+    arrivals += [(one.stamp_ns if one.stamp_ns < late_ns else begin_ns, one) for one in sightings]
+    before, after = ticks(T0, begin_ns - 1, 0.25), ticks(begin_ns, T0 + 18 * SECOND, 0.25)
+
+    def run(*, at_once: bool) -> tuple[Estimator, Estimate]:
+        estimator = Estimator(world.swarm, chosen)
+        play(estimator, [one for one in arrivals if one[0] < begin_ns], before)
+        left = [one for one in arrivals if one[0] >= begin_ns]
+        return estimator, play(estimator, left, after, has_budget=lambda: at_once)[-1]
+
+    (whole, at_once), (in_parts, last) = run(at_once=True), run(at_once=False)
+    assert not in_parts.is_fusing
+    assert in_parts.drops == whole.drops
+    np.testing.assert_allclose(last.poses, at_once.poses, atol=1e-9)
+    np.testing.assert_allclose(last.covariances, at_once.covariances, atol=1e-9)
+
+
+PERIOD_S = 0.05
+HORIZON_S = 2.0
+
+
+class Machine:
+    """An estimator whose sightings take a while each to fuse, and that does other things, too."""
+
+    def __init__(self, fusing: float, rest: float = 0.1) -> None:
+        self.fusing, self.rest = fusing, rest
+        self.shedding = Shedding(0.1, HORIZON_S)
+        self.now_s = self.seen_s = 100.0
+        self.shares: list[float] = []
+
+    def run(self, seconds: float) -> float:
+        """Tick for so long; how far the data lie behind at the end [s]."""
+        end_s = self.now_s + seconds
+        while self.now_s < end_s:
+            self.shedding.begin_tick(self.now_s, self.now_s - self.seen_s)
+            self.shedding.begin_fusion()
+            self.shares.append(self.shedding.share)
+            come_s, self.seen_s = self.now_s - self.seen_s, self.now_s
+            fusing_s = self.fusing * self.shedding.share * min(come_s, HORIZON_S)
+            busy_s = fusing_s + self.rest * come_s
+            self.shedding.note(busy_s, fusing_s)
+            self.now_s = max(self.now_s + busy_s, self.seen_s + PERIOD_S)
+        return self.now_s - self.seen_s
+
+
+def test_an_estimator_that_keeps_up_uses_all() -> None:
+    machine = Machine(fusing=0.7)
+    machine.run(20.0)
+    assert set(machine.shares) == {1.0}
+
+
+@pytest.mark.parametrize("fusing", [1.2, 3.0, 30.0])
+def test_with_too_much_to_do_the_ticks_soon_keep_to_their_period(fusing: float) -> None:
+    machine = Machine(fusing)
+    machine.run(60.0)
+    late_s = machine.run(PERIOD_S)
+    load = machine.rest + machine.fusing * machine.shedding.share
+    assert late_s == pytest.approx(PERIOD_S, abs=1e-9)
+    assert load < 0.9
+    assert machine.shedding.share > 0.25 / fusing
+    settled = machine.shares[-20:]
+    assert max(settled) == min(settled), "it goes up and down"
+
+
+def test_all_is_used_again_when_the_load_has_fallen() -> None:
+    machine = Machine(fusing=10.0)
+    machine.run(20.0)
+    machine.fusing = 0.3
+    machine.run(10.0)
+    assert machine.shedding.share == 1.0
+
+
+def test_what_would_not_help_is_not_shed() -> None:
+    machine = Machine(fusing=0.09, rest=2.0)
+    for _ in range(100):  # so far behind that a tick takes as long as what came before it, and more
+        machine.shedding.begin_tick(machine.now_s, 1.0)
+        machine.shedding.begin_fusion()
+        machine.shedding.note(1.0, 0.04)
+        machine.now_s += 1.0
+    assert machine.shedding.share == 1.0
+
+
+def test_what_was_shed_in_vain_is_used_again_though_the_node_stays_busy() -> None:
+    shedding = Shedding(0.1, HORIZON_S)
+    for second in range(20):
+        shedding.begin_tick(float(second), 1.0)
+        shedding.begin_fusion()
+        shedding.note(1.0, 0.9)
+    assert shedding.share == MIN_SHARE
+    for second in range(20, 100):  # something else takes all the time, and fusing hardly any
+        shedding.begin_tick(float(second), 1.0)
+        shedding.begin_fusion()
+        shedding.note(1.0, 0.02 * shedding.share)
+    assert shedding.share == 1.0
+
+
+def test_fusing_keeps_its_guaranteed_part_of_a_node_that_is_always_busy() -> None:
+    shedding, taken = Shedding(0.1, HORIZON_S), []
+    for second in range(400):
+        shedding.begin_tick(float(second), 1.0)
+        shedding.begin_fusion()
+        taken.append(min(2.0 * shedding.share, 0.9))
+        shedding.note(1.0, taken[-1])
+    assert min(taken[100:]) > 0.03
+    assert max(taken[100:]) < 0.15
+
+
+def test_a_little_is_always_used() -> None:
+    shedding = Shedding(0.1, HORIZON_S)
+    for second in range(50):
+        shedding.begin_tick(float(second), 1.0)
+        shedding.begin_fusion()
+        shedding.note(1.0, 1.0)
+    assert shedding.share == MIN_SHARE
+
+
+def test_a_node_that_is_busy_for_a_while_and_catches_up_again_leaves_nothing_out() -> None:
+    """As at its start: all memory is written to for the first time, and all robots are placed."""
+    machine = Machine(fusing=2.0)
+    machine.run(0.5)
+    machine.fusing = 0.5
+    machine.run(10.0)
+    assert set(machine.shares) == {1.0}
+    assert machine.run(PERIOD_S) == pytest.approx(PERIOD_S, abs=1e-9)
+
+
+def test_a_node_that_is_always_busy_but_does_not_fall_behind_leaves_nothing_out() -> None:
+    shedding = Shedding(0.1, HORIZON_S)
+    for tick in range(200):
+        shedding.begin_tick(0.1 * tick, 0.4)
+        shedding.begin_fusion()
+        shedding.note(0.1, 0.08)
+    assert shedding.share == 1.0
+
+
+def test_it_waits_for_what_a_cut_brings() -> None:
+    """A fusion that takes long is of what came before the cut."""
+    shedding = Shedding(0.1, HORIZON_S)
+    for tick in range(40):
+        shedding.begin_tick(0.1 * tick, 0.1 * tick)
+        shedding.note(0.1, 0.09)
+    assert shedding.share == 0.5
+    shedding.begin_fusion()
+    for tick in range(40, 60):
+        shedding.begin_tick(0.1 * tick, 0.1 * (tick - 39))
+        shedding.note(0.1, 0.09)
+    assert shedding.share == 0.25

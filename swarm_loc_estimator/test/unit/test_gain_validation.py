@@ -1,7 +1,5 @@
 """Gains are kept where they help exchanges that they were not estimated from, and else refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ir_world import droplet, random_poses

@@ -1,7 +1,5 @@
 """Gyroscopes against wheels: wrong ones are named and left out, what lasts short or skids is not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The log of a node: each problem once in a while, drops with their reasons, and silent topics."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from swarm_loc_estimator.common.health import PATIENCE_S, THROTTLE_S, Health, drop_values, listed

@@ -1,7 +1,5 @@
 """Which detection is me: chains and their probabilities."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Scale
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
 
 SECOND = 10**9

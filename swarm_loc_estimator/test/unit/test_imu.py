@@ -1,7 +1,5 @@
 """Turns by a gyroscope: any order of arrival, gaps, mount, standing robots, messages."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From brightness matrices to relative measurements: which pose, whose, and why not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -207,11 +205,11 @@ def test_measured_exchanges_are_those_since_the_last_restart() -> None:
     converter = BrightnessConverter(swarm_of())
     converter.take(rows_of(*heard()))
     converter.forget_before(T0 + 1)
-    assert converter.measured == 2
+    assert converter.counters["infrared exchanges measured"] == 2
     converter.restart()
-    assert converter.measured == 0
+    assert converter.counters["infrared exchanges measured"] == 0
     converter.take(rows_of(*heard()))
-    assert converter.measured == 2
+    assert converter.counters["infrared exchanges measured"] == 2
 
 
 def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:

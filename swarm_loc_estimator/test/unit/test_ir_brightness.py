@@ -1,13 +1,27 @@
-"""Expected readings, their slopes, and what goes wrong with eqs (1)-(4) as printed."""
+"""The model of brightness: its values, slopes and cost, and the gains of elements."""
 
-from __future__ import annotations
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from ir_world import droplet, droplet_matrix, random_poses
+from ir_world import droplet, droplet_matrix, nees, pair_of, pose_errors, random_poses, readings_of
 
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
-from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrGains, PairGains, load_ir_platform
+from swarm_loc_estimator.infrared.cost import (
+    MEASURED,
+    MISSING,
+    SATURATED,
+    CostWorkspace,
+    Pair,
+    cost_of,
+    new_cost_workspace,
+    reading_cost,
+)
+from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
+from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrGains, IrModel, PairGains, load_ir_platform
 
 
 def test_readings_are_those_of_the_corrected_equations() -> None:
@@ -72,3 +86,207 @@ def test_contact_and_coincidence_stay_finite() -> None:
     readings, slopes = expected_with_slopes(droplet(), [[0.0, 0.0, 0.0], [0.044, 0.5236, 3.1416]])
     assert np.isfinite(readings).all()
     assert np.isfinite(slopes).all()
+
+
+PLATFORMS = {
+    "blocked": droplet(),
+    "never blocked": replace(droplet(), blocked_share=0.0),
+    "relative": replace(droplet(), relative_noise=0.1),
+    "systematic": replace(droplet(), relative_noise=0.05, curve_sigma=0.1),
+    "bright": load_ir_platform("droplet_2016"),
+}
+
+
+def one_by_one(
+    model: IrModel, pair: Pair, bright: FloatArray, slopes: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Cost, gradient (3,), Hessian (3, 3), tally (3,), systematic information (3, 3), by reading."""
+    total, gradient, tally = 0.0, np.zeros(3), np.array([0.0, -3.0, 0.0])
+    hessian, systematic = np.zeros((2, 3, 3))
+    for f in np.flatnonzero(pair.kinds != MISSING):
+        cost, pull, weight, sure, share, square = reading_cost(
+            model.errors, pair.kinds[f], pair.cut[f], pair.stable[f], bright[f]
+        )
+        both = np.outer(slopes[f], slopes[f])
+        total += cost
+        gradient += pull * slopes[f]
+        hessian += weight * both
+        systematic += share * weight * both
+        tally += [2.0 * cost * sure, sure and pair.kinds[f] == MEASURED, square]
+    return total, gradient, hessian, tally, systematic
+
+
+def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, CostWorkspace]:
+    """By `cost_of`."""
+    work = new_cost_workspace(model.amplitudes.shape[0], model.angles.size, False)
+    return cost_of(model, pair, pose, work, work.gradients[0], work.hessians[0]), work
+
+
+@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize("away", [0.0, 0.3])
+def test_the_cost_is_the_sum_over_readings(name: str, away: float) -> None:
+    """Near the pose, and where many readings are outliers; with saturated, missing and blocked ones."""
+    platform, rng = PLATFORMS[name], np.random.default_rng(5)
+    model, gains = platform.model, rng.uniform(0.9, 1.1, (2, 6))
+    for pose in random_poses(20, 5, low=0.06, high=0.2):
+        readings = readings_of(platform, pose[None], 5)[0]
+        readings[rng.random(readings.shape) < 0.1] = 0.0
+        readings[rng.random(readings.shape) < 0.1] = math.nan
+        pair = pair_of(model, readings, 0.6 * float(np.nanmax(readings)), gains)
+        assert {MISSING, MEASURED, SATURATED} == set(pair.kinds.tolist())
+        at = pose + away * np.array([0.03, 1.0, -1.0])
+        bright, slopes = expected_with_slopes(platform, at)
+        factor = np.outer(*gains)
+        wanted = one_by_one(
+            model, pair, (factor * bright[0]).ravel(), (factor[..., None] * slopes[0]).reshape(-1, 3)
+        )
+        cost, work = costs_at(model, pair, at)
+        hessian = np.tril(work.hessians[0]) + np.tril(work.hessians[0], -1).T
+        found = (cost, work.gradients[0], hessian, work.tally, work.systematic)
+        for one, other in zip(map(np.asarray, found), map(np.asarray, wanted), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9 * max(float(np.abs(other).max()), 1.0))
+
+
+def test_what_a_dead_element_reads_does_not_count() -> None:
+    model, pose = droplet().model, random_poses(1, 6, low=0.1)[0]
+    readings = readings_of(droplet(), pose[None], 6)[0]
+    gains = np.ones((2, 6))
+    gains[0, 2], gains[1, 4] = math.nan, math.nan
+    missing = readings.copy()
+    missing[:, 2], missing[:, :, 4] = math.nan, math.nan
+    dead, _ = costs_at(model, pair_of(model, readings, 255.0, gains), pose)
+    without, _ = costs_at(model, pair_of(model, missing, 255.0), pose)
+    assert dead == without
+
+
+ROBOTS = 3
+
+
+def recorded(
+    count: int, seed: int, *, known: bool, low: float = 0.08, high: float = 0.28
+) -> tuple[FloatArray, Exchanges]:
+    """True log-gains (2, robots, n), and what robots read of each other."""
+    rng = np.random.default_rng(seed)
+    logs = 0.1 * rng.standard_normal((2, ROBOTS, 6))
+    receiver = rng.integers(0, ROBOTS, count)
+    transmitter = (receiver + rng.integers(1, ROBOTS, count)) % ROBOTS
+    poses = random_poses(count, seed, low, high)
+    readings = readings_of(droplet(), poses, seed, pairs_of(logs, receiver, transmitter))
+    saturation = np.full(readings.shape[:2], droplet().saturation)
+    told = poses if known else np.full_like(poses, np.nan)
+    return logs, Exchanges(receiver, transmitter, readings, saturation, told)
+
+
+def pairs_of(logs: FloatArray, receiver: IntArray, transmitter: IntArray) -> PairGains:
+    """Exact gains."""
+    factors = np.exp(logs)
+    return PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((len(receiver), 4)))
+
+
+def errors_of(fit: GainsFit, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Errors of log-gains about their mean (2, robots, n), and of the mean of pairs (robots, robots)."""
+    found = np.log([[gains.sensor for gains in fit.gains], [gains.emitter for gains in fit.gains]])
+    error = found - logs
+    means = error.mean(axis=-1)
+    return error - means[..., None], (means[0][:, None] + means[1])[~np.eye(ROBOTS, dtype=bool)]
+
+
+@pytest.mark.parametrize(("known", "own_limit", "pair_limit"), [(True, 0.008, 0.005), (False, 0.03, 0.03)])
+def test_gains_come_out_as_they_are_and_as_sure_as_is_said(
+    known: bool, own_limit: float, pair_limit: float
+) -> None:
+    logs, exchanges = recorded(300, 1, known=known)
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges)
+    own, pair = errors_of(fit, logs)
+    assert np.std(own) < own_limit
+    assert np.std(pair) < pair_limit
+    said = np.array([(gains.sigma, gains.common_sigma) for gains in fit.gains])
+    assert 0.4 < np.std(own) / np.sqrt(np.mean(said[:, 0] ** 2)) < 1.8
+    assert np.sqrt(np.mean(pair**2)) < 3.0 * np.sqrt(2.0 * np.mean(said[:, 1] ** 2))
+    assert np.mean(fit.used) > 0.9
+    before, after = (np.sqrt(np.nanmean(residuals**2)) for residuals in (fit.before, fit.after))
+    assert after < 1.05
+    assert before > 1.3
+
+
+@pytest.mark.parametrize(("known", "own_limit", "pair_limit"), [(True, 0.01, 0.01), (False, 0.018, 0.055)])
+def test_ambient_light_that_was_not_subtracted_does_not_matter(
+    known: bool, own_limit: float, pair_limit: float
+) -> None:
+    logs, exchanges = recorded(300, 8, known=known)
+    ambient = np.random.default_rng(8).uniform(0.0, 1.5, (300, 1, 6, 1))
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges._replace(readings=exchanges.readings + ambient))
+    own, pair = errors_of(fit, logs)
+    assert np.std(own) < own_limit
+    assert np.sqrt(np.mean(pair**2)) < pair_limit
+
+
+def test_gains_are_less_sure_of_exchanges_that_contradict_each_other() -> None:
+    """Robots that move while they exchange: poses that are a little off."""
+    logs, exchanges = recorded(300, 9, known=True)
+    rng = np.random.default_rng(9)
+    shaken = exchanges.poses + rng.standard_normal((300, 3)) * [0.001, 0.03, 0.03]
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges._replace(poses=shaken))
+    own, _ = errors_of(fit, logs)
+    said = np.sqrt(np.mean([gains.sigma**2 for gains in fit.gains]))
+    assert 0.5 < np.std(own) / said < 1.8
+
+
+def test_calibrated_robots_measure_better() -> None:
+    """As much as is asked of a Droplet at 20 cm: 10 % mismatch costs half a centimetre, then a tenth."""
+    logs, exchanges = recorded(600, 2, known=False)
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges)
+    poses = random_poses(600, 3, low=0.2, high=0.2)
+    zero, one = np.zeros(600, int), np.ones(600, int)
+    readings = readings_of(droplet(), poses, 3, pairs_of(logs, zero, one))
+    estimator = MaximumLikelihood(droplet(0.1))
+    gains = PairGains.of([fit.gains[0]] * 600, [fit.gains[1]] * 600)
+    before, after = estimator.solve(readings), estimator.solve(readings, gains)
+    errors = pose_errors(after.poses, poses)
+    assert np.mean(np.abs(errors[:, 0])) < 0.4 * np.mean(np.abs(before.poses[:, 0] - 0.2))
+    assert np.mean(nees(errors, after.covariances)) < 6.0
+
+
+def test_far_robots_alone_leave_the_common_gain_open_and_that_is_said() -> None:
+    logs, exchanges = recorded(200, 4, known=False, low=0.2, high=0.28)
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges)
+    _, pair = errors_of(fit, logs)
+    said = np.sqrt(2.0 * np.mean([gains.common_sigma**2 for gains in fit.gains]))
+    assert said > 0.02
+    assert np.sqrt(np.mean(pair**2)) < 3.0 * said
+    with_poses = estimate_gains(droplet(0.1), ROBOTS, recorded(200, 4, known=True, low=0.2, high=0.28)[1])
+    assert np.mean([gains.common_sigma for gains in with_poses.gains]) < 0.3 * said
+
+
+def test_a_robot_that_took_part_in_nothing_is_as_unsure_as_before() -> None:
+    exchanges = recorded(100, 5, known=True)[1]
+    alone = (exchanges.receiver < 2) & (exchanges.transmitter < 2)
+    exchanges = Exchanges._make(column[alone] for column in exchanges)
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges)
+    np.testing.assert_allclose(fit.gains[2].sensor, 1.0)
+    np.testing.assert_allclose(fit.gains[2].emitter, 1.0)
+    total = np.hypot(fit.gains[2].sigma, fit.gains[2].common_sigma)
+    assert total == pytest.approx(0.1, rel=1e-6)
+
+
+def test_exchanges_that_went_wrong_do_not_matter() -> None:
+    logs, exchanges = recorded(300, 6, known=True)
+    rng = np.random.default_rng(6)
+    exchanges.readings[:30] = rng.permuted(exchanges.readings[:30], axis=3)
+    exchanges.readings[30:60] = rng.standard_normal((30, 2, 6, 6))
+    exchanges.readings[60:80] = np.nan
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges)
+    own, pair = errors_of(fit, logs)
+    assert np.std(own) < 0.01
+    assert np.std(pair) < 0.01
+    assert not fit.used[30:80].any()
+    assert np.mean(fit.used[:30]) < 0.5
+
+
+def test_matrices_that_tell_nothing_are_refused_in_one_sentence() -> None:
+    exchanges = recorded(20, 7, known=False)[1]
+    with pytest.raises(GainsError, match="element_sigma of the platform is 0, so that all gains are 1"):
+        estimate_gains(droplet(), ROBOTS, exchanges)
+    exchanges.readings[:] = 0.0
+    with pytest.raises(GainsError, match="None of 20 exchanges determines a pose"):
+        estimate_gains(droplet(0.1), ROBOTS, exchanges)

@@ -1,7 +1,5 @@
 """Boards whose readings may be blocked or too bright: poses are honest, and none is read into noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ir_world import nees, pair_of, pose_errors, random_poses, readings_of

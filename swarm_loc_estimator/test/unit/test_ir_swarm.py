@@ -1,7 +1,5 @@
 """Laws of a swarm that hears each other's light: located through IR alone, honestly, in any order."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,18 +1,40 @@
-"""The cache of compiled code: found again wherever the sources lie, and never used for other code."""
-
-from __future__ import annotations
+"""Compiled code: the cache, its wheel, and what is compiled at start."""
 
 import hashlib
+import json
 import os
 import pickle
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import cast
+from zipfile import ZipFile
 
+import numpy as np
 import pytest
+from compiled_code import compiled_since, printed_by_process, signatures
 from llvmlite import binding
+
+from bench.shared.bags import SharedHead, copy_part, encode_shared_detections, encode_shared_numbers
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, swarm_key
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
+from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.nodes.load import Thinning
+from swarm_loc_estimator.nodes.mapper_precompile import precompile as precompile_mapper_precompile
+from swarm_loc_estimator.offline.map_replay import replay_map
+from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
+from swarm_loc_estimator.precompile import Size, precompile, size_of
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 USED = """
 from typing import NamedTuple
@@ -239,3 +261,299 @@ def test_code_that_nobody_has_used_for_a_month_is_deleted(tmp_path: Path, cache:
     assert not (folder / "old.nbc").exists()
     assert (folder / "recent.nbc").exists()
     assert all(file.stat().st_mtime > time.time() - 86400.0 for file in used)
+
+
+BAGS = Path(__file__).parents[3] / "bags"
+SECOND = 1_000_000_000
+SPAN_NS = 12 * SECOND
+RECORDED = ("aerial_five", "droplets_twenty", "eight_five_robots")
+
+
+# Each of these takes as long to import as numpy; that of linear algebra is loaded with compiled code.
+SLOW = tuple(f"scipy.{part}" for part in ("interpolate", "ndimage", "optimize", "spatial", "special"))
+
+
+class EnoughError(Exception):
+    """The beginning of a bag is enough."""
+
+
+@pytest.mark.parametrize("size", ["small", "large", "sparse"])
+def test_nothing_is_compiled_once_data_come(size: Size) -> None:
+    assert printed_by_process(__file__, size) == []
+
+
+def test_robots_that_see_markers_start_without_the_slow_parts_of_scipy() -> None:
+    started = (
+        "from swarm_loc_estimator.precompile import precompile\n"
+        "precompile('small', False)\n"
+        f"import sys; print([part for part in {SLOW} if part in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", started], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "size"),
+    [
+        ("eight_five_robots", Settings(), "small"),
+        ("droplets_twenty", Settings(), "large"),
+        ("droplets_twenty", Settings(sparse_from=20), "sparse"),
+        ("droplets_twenty", Settings(sparse_from=20, fusion_period_s=0.0), "large"),
+    ],
+)
+def test_what_is_compiled_follows_the_size_of_the_swarm(name: str, settings: Settings, size: Size) -> None:
+    assert size_of(load_swarm(BAGS / name / "swarm.yaml"), settings) == size
+
+
+def compiled_late(size: Size) -> list[str]:
+    """What is compiled when robots are replayed though all is warm; in a process of its own."""
+    for infrared in (False, True):
+        precompile(size, infrared)
+    before = signatures()
+    eight = BAGS / "eight_five_robots"
+    if size == "sparse":
+        run_precompile(eight, Settings(sparse_from=2))
+        run_precompile(eight, Settings(sparse_from=2), relayed=True)
+        run_precompile(BAGS / "droplets_twenty", Settings(sparse_from=2))
+    elif size == "large":
+        together = Settings(fusion_period_s=0.1, policy=Policy(large_from=2))
+        for name in RECORDED:
+            run_precompile(BAGS / name, together)
+        run_precompile(eight, together, relayed=True)
+    else:
+        for name in RECORDED:
+            run_precompile(BAGS / name, Settings(policy=Policy(large_from=100)))
+        run_precompile(eight, Settings(), late=True)
+        run_precompile(eight, Settings(), moved_landmarks=True)
+        run_precompile(eight, Settings(), relayed=True)
+    return compiled_since(before)
+
+
+def run_precompile(
+    bag: Path, settings: Settings, *, late: bool = False, moved_landmarks: bool = False, relayed: bool = False
+) -> None:
+    """Estimate the beginning of a bag as the node does.
+
+    Args:
+        bag: Of robots whose description is beside it.
+        settings: Of the estimator.
+        late: Whether odometry comes out of order.
+        moved_landmarks: Whether the map is wrong.
+        relayed: Whether robots share their topics, and half of what is seen is left out.
+    """
+    swarm = load_swarm(bag / "swarm.yaml")
+    if moved_landmarks:
+        marks = (replace(mark, x=mark.x + 0.3 * (k % 3)) for k, mark in enumerate(swarm.landmarks))
+        swarm = replace(swarm, landmarks=tuple(marks))
+    estimator, begun_ns = Estimator(swarm, settings), list[int]()
+    thinning, ingest = Thinning(len(swarm.robots)), Ingest(swarm)
+
+    def take(inputs: Batch) -> None:
+        begun_ns.append(inputs.begin_ns)
+        if inputs.begin_ns - begun_ns[0] > SPAN_NS:
+            raise EnoughError
+        rows = inputs["odometry"]
+        turned = type(rows)(*(column[::-1].copy() for column in rows))
+        inputs = replace(inputs, rows={**inputs.rows, "odometry": turned}) if late else inputs
+        if relayed:
+            inputs = thinning.thin(shared(inputs, ingest, swarm), 0.5).messages
+        estimator.receive(inputs)
+        estimator.tick(inputs.end_ns)
+        estimator.contradictions(inputs.end_ns)
+        estimator.recent()
+
+    _quietly(lambda: read_bag(bag, swarm, take, unwatched))
+
+
+def shared(inputs: Batch, ingest: Ingest, swarm: Swarm) -> Batch:
+    """The same by topics that all robots share."""
+    key, now_ns = swarm_key(robot.name for robot in swarm.robots), inputs.end_ns
+    odometry, seen = (
+        SharedHead(now_ns, "odom", key, rows.robot, rows.stamp_ns)
+        for rows in (inputs["odometry"], inputs["detections"])
+    )
+    seen_detections = inputs["detections"].detection if seen.robot.size else np.zeros(0, DETECTION_DTYPE)
+    messages = {
+        "swarm/odom": encode_shared_numbers(odometry, inputs["odometry"].pose),
+        "swarm/detections": encode_shared_detections(seen, seen_detections),
+    }
+    batch = MessageBatch.of(
+        [SerializedMessage(ingest.handle_of[name], data, now_ns) for name, data in messages.items()]
+    )
+    (relayed,) = ingest.read(batch)
+    return relayed
+
+
+def _quietly(work: Callable[[], object]) -> None:
+    try:
+        work()
+    except EnoughError:
+        return
+
+
+if __name__ == "__main__":
+    json.dump(compiled_late(cast("Size", sys.argv[1])), sys.stdout)
+
+
+BAG = Path(__file__).parents[3] / "bags" / "pushbots_two"
+FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}
+
+
+def test_nothing_is_compiled_once_robots_report() -> None:
+    assert printed_by_process(__file__) == []
+
+
+def compiled_late_mapper_precompile() -> list[str]:
+    """What is compiled when robots are replayed though all is warm; in a process of its own."""
+    precompile_mapper_precompile()
+    before = signatures()
+    swarm = load_swarm(BAG / "swarm.yaml")
+    with TemporaryDirectory() as folder:
+        begin = Path(folder, "begin")
+        copy_part(BAG, begin, 80.0)  # the rest of the bag calls the same functions
+        mapper, feed, _ = replay_map(begin, swarm, MapperSettings(), FREQUENCIES, lambda _share, _what: None)
+    for index in range(len(swarm.robots)):
+        number = feed.number(index)
+        goal = None if number is None else mapper.goal(number)
+        if number is not None and goal is not None:
+            fix_covariance(mapper.covariance(number))
+        mapper.visits.on(mapper.occupancy())
+    return compiled_since(before)
+
+
+if __name__ == "__main__":
+    json.dump(compiled_late_mapper_precompile(), sys.stdout)
+
+
+PACKAGE = Path(__file__).parents[2]
+BAG_WHEEL = PACKAGE.parent / "bags" / "eight_one_robot_fast"
+BUILD = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
+SWARM_LOC = """
+import sys
+
+class Refused:
+    def find_spec(self, name, path=None, target=None):
+        package = name.partition(".")[0]
+        if package.endswith("_msgs") or package in {"ament_index_python", "launch", "rclpy", *REFUSED}:
+            raise ModuleNotFoundError(f"{name} is refused", name=name)
+
+sys.meta_path.insert(0, Refused())
+from swarm_loc_estimator.start import swarm_loc
+
+def run(*arguments):
+    sys.argv[:] = ["/somewhere/bin/swarm-loc", *arguments]
+    try:
+        return swarm_loc()
+    except SystemExit as end:
+        return end.code
+"""
+COMMANDS = {
+    *("calibrate", "calibrate_ir", "doctor", "import_droplets", "import_mrclam", "new"),
+    *("replay", "replay_map", "schema", "survey", "sweep"),
+}
+NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}
+STARTERS = {"demo", "graph", "watch"}  # Commands that start nodes
+
+
+def python(
+    code: str, *arguments: str, path: Path = PACKAGE, refused: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Run code after `SWARM_LOC` where nothing of ROS can be imported, with a package from a folder."""
+    env = {name: value for name, value in os.environ.items() if name != "AMENT_PREFIX_PATH"}
+    program = f"REFUSED = {refused.split()}\n{SWARM_LOC}\n{code}"
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(
+        command, env={**env, "PYTHONPATH": str(path)}, capture_output=True, text=True, check=False, cwd=path
+    )
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
+    """The wheel, built of a copy of the package that has nothing beside it."""
+    folder = tmp_path_factory.mktemp("wheel")
+    copy = folder / "package"
+    shutil.copytree(
+        PACKAGE, copy, ignore=shutil.ignore_patterns("test", "__pycache__", "*.egg-info", "build")
+    )
+    subprocess.run([sys.executable, "-c", BUILD, folder], cwd=copy, check=True, capture_output=True)
+    (built,) = folder.glob("swarm_loc_estimator-*-py3-none-any.whl")
+    return ZipFile(built)
+
+
+def test_a_wheel_has_all_files_of_the_package(wheel: ZipFile) -> None:
+    root = PACKAGE / "swarm_loc_estimator"
+    files = {path for path in root.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+    files |= set((root / "common" / "messages" / "msg").iterdir())
+    names = {str(path.relative_to(PACKAGE)) for path in files}
+    assert names == {name for name in wheel.namelist() if name.startswith("swarm_loc_estimator/")}
+    assert "swarm_loc_estimator/common/messages/msg/SwarmPose.msg" in names
+
+
+def test_it_has_one_program_and_the_license(wheel: ZipFile) -> None:
+    (entries,) = [name for name in wheel.namelist() if name.endswith("/entry_points.txt")]
+    assert wheel.read(entries).decode().split() == [
+        *("[console_scripts]", "swarm-loc", "=", "swarm_loc_estimator.start:swarm_loc")
+    ]
+    assert [name for name in wheel.namelist() if name.endswith("/LICENSE")]
+
+
+def test_it_replays_a_bag_with_its_plots_without_ros(wheel: ZipFile, tmp_path: Path) -> None:
+    wheel.extractall(tmp_path / "site")
+    shutil.copytree(BAG_WHEEL, tmp_path / "bag")
+    out = tmp_path / "out"
+    code = "status = run('replay', *sys.argv[1:]); print(swarm_loc.__globals__['__file__']); sys.exit(status)"
+    done = python(code, str(tmp_path / "bag"), "--out", str(out), path=tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    assert "NEES" in done.stdout
+    assert done.stdout.splitlines()[-1] == str(tmp_path / "site" / "swarm_loc_estimator" / "start.py")
+    made = {"errors.png", "overview.png", "poses.csv", "report.html", "report.txt"}
+    assert {path.name for path in out.iterdir()} == made
+
+
+def test_swarm_loc_lists_all_commands_and_loads_little() -> None:
+    code = "run(*sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    listed, asked = python(code), python(code, "--help")
+    assert listed.stdout == asked.stdout
+    without, _, with_ros = listed.stdout.partition("With ROS 2:")
+    assert {line.split()[0] for line in without.splitlines() if line.startswith("  ")} == COMMANDS
+    assert {line.split()[0] for line in with_ros.splitlines() if line} == NODES | STARTERS
+    assert "  replay           Replay a bag through the estimator: poses, " in without
+    assert not {"numpy", "swarm_loc_estimator.cli"} & set(listed.stderr.split())
+
+
+def test_commands_run_without_ros_and_the_others_say_that_they_need_it() -> None:
+    names = sorted(COMMANDS | NODES | STARTERS)
+    code = "print(*[name for name in sys.argv[1:] if run(name, '--help') == 1], file=sys.stderr)"
+    done = python(code, *names)
+    *sentences, failed = done.stderr.splitlines()
+    assert set(failed.split()) == NODES | {"demo"}
+    assert [one.split(":")[0] for one in sentences] == [
+        f"swarm-loc {name} needs ROS 2 and this workspace, built and sourced" for name in failed.split()
+    ]
+    for name in COMMANDS:
+        assert f"usage: swarm-loc {name} [-h]" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["graph", "watch"])
+def test_commands_that_start_nodes_say_so_once_they_start_them(name: str) -> None:
+    done = python("sys.exit(run(*sys.argv[1:]))", name, str(BAG_WHEEL / "swarm.yaml"))
+    assert done.returncode == 1
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith(f"swarm-loc {name} needs ROS 2")
+
+
+def test_a_bag_without_the_libraries_for_bags_ends_with_one_sentence() -> None:
+    done = python("sys.exit(run(*sys.argv[1:]))", "replay", str(BAG_WHEEL), refused="rosbags mcap")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "swarm-loc replay needs the Python package rosbags, which is not installed:"
+        " pip install lz4 mcap rosbags zstandard.\n"
+    )
+
+
+def test_an_unknown_command_is_one_sentence() -> None:
+    done = python("sys.exit(run(*sys.argv[1:]))", "reply")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "swarm-loc has no command 'reply'; swarm-loc --help lists them.\n",
+    )

@@ -14,8 +14,6 @@ from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, decode, encode
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import SELF_CALIBRATED
@@ -155,12 +153,12 @@ def test_the_replay_command_writes_what_it_learned_and_reports_it(
 def test_odometry_with_a_swapped_sign_is_named_and_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, description: str, key: str
 ) -> None:
-    copy_part(BAG, tmp_path / "right", 20.0)
-    with BagReader(tmp_path / "right") as reader, BagWriter(tmp_path / "bag") as writer:
-        for topic in reader.topics:
-            writer.add_topic(topic.name, topic.type)
-        for name, _, log_ns, data in reader.messages():
-            writer.write(name, log_ns, swapped(data, what) if name == "epuck2/odom" else data)
+    copy_part(
+        BAG,
+        tmp_path / "bag",
+        20.0,
+        change=lambda name, at, data: (at, swapped(data, what) if name == "epuck2/odom" else data),
+    )
     learned = tmp_path / "learned.yaml"
     command = [str(tmp_path / "bag"), "--swarm", str(BAG / description), "--out", str(tmp_path / "out")]
     assert main([*command, "--learned", str(learned)]) == 1

@@ -1,7 +1,5 @@
 """Scans of lidars: what of them is used, motion during a sweep, and the map of a robot that does not stop."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Robots with lidars in a known map: poses, replay, order of arrival, wrong starts, descriptions."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

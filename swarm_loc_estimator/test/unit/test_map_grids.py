@@ -1,7 +1,5 @@
 """Grids, planning, and map files."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -1,7 +1,5 @@
 """Matching of sweeps to a known map: laws of the match, corridors, beams that do not fit, refusals."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

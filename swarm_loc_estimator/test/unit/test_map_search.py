@@ -1,7 +1,5 @@
 """Starts in a known map: where a robot without a start is found, and what it says where it is not."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Maps of walls by topic: the same poses as by file, changes at run time, replay, refused messages."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

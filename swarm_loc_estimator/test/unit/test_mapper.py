@@ -1,7 +1,5 @@
 """The mapper: one robot and two in a small room, whatever the messages' sizes, and what it says of itself."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Messages of robots to the mapper, as they come."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

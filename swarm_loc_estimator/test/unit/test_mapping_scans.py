@@ -1,7 +1,5 @@
 """Scans: lines that beams tell, the ratio of turns, beams against lines with their Jacobians."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,16 +1,32 @@
-"""Measurement models against explicit transform chains, and against the equations as they were printed."""
+"""Columns of measurements, and the buffer that keeps them."""
 
+import gc
 import math
+import random
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from core_geometry import planar, pose_of
+from core_messages import T0
+from core_run import on_time, play, settled, ticks
+from core_world import Plan, simulate
+from hypothesis import given
+from hypothesis import strategies as st
+from ir_world import droplet, random_poses, readings_of
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
+from numba.core.runtime.nrt import rtsys
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import inlined_njit, norefcount_njit
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import CARTESIAN, POLAR, predict, write_innovation
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Policy, Settings
+from swarm_loc_estimator.timeline.timeline import MeasurementBuffer
 
 WHO = {"landmark": (0, NOBODY), "surveyed": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
 """Observer and target; the place of the landmark "surveyed" is estimated."""
@@ -205,3 +221,136 @@ def test_columns_of_many_measurements_are_contiguous_as_those_of_one_are() -> No
     parts = [select(many, some) for some in (slice(1, 3), many.stamp_ns == 0, np.array([2, 0]))]
     for columns in (many, *parts, many.row(1).columns(), concatenate(parts)):
         assert all(column.flags.c_contiguous for column in columns)  # else all is compiled again for one
+
+
+Row = tuple[int, int, int, float]
+ROW = st.tuples(
+    st.integers(-20, 20), st.integers(-1, 2), st.integers(0, 2), st.sampled_from([-1.0, 0.0, 1.5])
+)
+
+
+def measurements(rows: list[Row]) -> Measurements:
+    many = Measurements.empty(len(rows))
+    for k, (stamp_ns, observer, reading, value) in enumerate(rows):
+        many.stamp_ns[k], many.observer[k], many.reading[k] = stamp_ns, observer, reading
+        many.value[k, 1] = value
+    return many
+
+
+def in_bytes(measurements: Measurements) -> bytes:
+    return b"".join(column.tobytes() for column in measurements)
+
+
+@given(st.lists(st.lists(ROW, max_size=8), max_size=8), st.randoms())
+def test_any_order_gives_the_same_each_once(parts: list[list[Row]], order: random.Random) -> None:
+    rows = [row for part in parts for row in part]
+    buffer, other = MeasurementBuffer(), MeasurementBuffer()
+    known: set[Row] = set()
+    for part in parts:
+        count, first_ns = buffer.merge(measurements(part))
+        new = set(part) - known
+        assert count == len(new)
+        assert first_ns == min((row[0] for row in new), default=None)
+        known |= new
+    order.shuffle(rows)
+    for row in rows:
+        other.merge(measurements([row]))
+    assert in_bytes(buffer.part(0, len(buffer))) == in_bytes(other.part(0, len(other)))
+    assert len(buffer) == len(known)
+    assert buffer.stamp_ns.tolist() == sorted(row[0] for row in known)
+    np.testing.assert_array_equal(buffer.part(0, len(buffer)).stamp_ns, buffer.stamp_ns)
+
+
+@given(st.lists(st.lists(ROW, max_size=8), max_size=8))
+def test_what_was_computed_goes_with_its_measurement(parts: list[list[Row]]) -> None:
+    """It is read while what has come since is fused, which takes a while."""
+    buffer = MeasurementBuffer()
+    computed: dict[bytes, tuple[int, float]] = {}
+    for part in parts:
+        buffer.merge(measurements(part))
+        for k in range(len(buffer)):
+            row = in_bytes(buffer.part(k, k + 1).row(0))
+            verdict, nis = computed.setdefault(row, (0, np.nan))
+            assert buffer.verdicts[k] == verdict
+            np.testing.assert_equal(buffer.nis[k], nis)
+            buffer.verdicts[k], buffer.nis[k] = 1 + len(computed) % 3, float(len(computed))
+            computed[row] = int(buffer.verdicts[k]), float(buffer.nis[k])
+
+
+@pytest.mark.parametrize("name", Measurements._fields)
+def test_each_column_moves_with_its_measurement_and_tells_two_apart_but_the_arrival(name: str) -> None:
+    pair, earlier, buffer = Measurements.empty(2), Measurements.empty(1), MeasurementBuffer()
+    getattr(pair, name)[1] = 1 - getattr(pair, name)[1].astype(int)
+    count, _ = buffer.merge(pair)
+    assert count == (1 if name == "arrival_ns" else 2)
+    before = in_bytes(buffer.part(0, count))
+    earlier.stamp_ns[:] = -1
+    buffer.merge(earlier)
+    assert in_bytes(buffer.part(1, count + 1)) == before
+    assert in_bytes(buffer.part(0, 1)) == in_bytes(earlier)
+
+
+def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again() -> None:
+    buffer = MeasurementBuffer()
+    for lap in range(200):
+        buffer.merge(measurements([(100 * lap + k, 0, 0, 0.0) for k in range(100)]))
+        buffer.nis[-100:] = lap
+        buffer.verdicts[-100:] = lap % 3
+        if lap >= 5:
+            buffer.drop_first(100)
+            assert buffer.nis.tolist() == [float(k) for k in range(lap - 4, lap + 1) for _ in range(100)]
+            assert buffer.verdicts.tolist() == [k % 3 for k in range(lap - 4, lap + 1) for _ in range(100)]
+    assert buffer.stamp_ns.tolist() == [*range(19500, 20000)]
+    assert buffer._columns.size < 5000
+
+
+@pytest.fixture
+def counted() -> Iterator[None]:
+    """Numba counts what it allocates and frees."""
+    _nrt_python.memsys_enable_stats()
+    yield
+    _nrt_python.memsys_disable_stats()
+
+
+def held() -> int:
+    """How many arrays compiled code holds, beyond those of before it counted."""
+    gc.collect()
+    stats = rtsys.get_allocation_stats()  # type: ignore[no-untyped-call]
+    return int(stats.mi_alloc - stats.mi_free)
+
+
+@pytest.mark.usefixtures("counted")
+@pytest.mark.parametrize("many", [3, 1000])
+def test_a_run_leaves_no_array_behind(many: int) -> None:
+    """Of measurements used together, and one by one."""
+    world = simulate(Plan(3, 4.0), 1)
+    counts = []
+    for _ in range(3):
+        estimator = Estimator(world.swarm, Settings(policy=Policy(large_from=1, batch_from=many)))
+        play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1])))
+        assert settled(estimator)["USED"] > 20
+        del estimator
+        counts.append(held())
+    assert counts[0] == counts[1] == counts[2]
+
+
+@pytest.mark.usefixtures("counted")
+@pytest.mark.parametrize("element_sigma", [0.0, 0.1])
+def test_solving_pairs_leaves_no_array_behind(element_sigma: float) -> None:
+    """Neither of calls nor of pairs."""
+    estimator = MaximumLikelihood(droplet(element_sigma))
+    readings = readings_of(droplet(), random_poses(20, 1), 1)
+    counts = []
+    for pairs in (1, 20, 20):
+        estimator.solve(readings[:pairs])
+        counts.append(held())
+    assert counts[0] == counts[1] == counts[2]
+
+
+@pytest.mark.parametrize("borrow", [norefcount_njit, inlined_njit])
+def test_what_borrows_arrays_returns_none(borrow: Callable[[Callable[..., object]], object]) -> None:
+    def view(array: FloatArray) -> FloatArray:
+        return array[:1]
+
+    with pytest.raises(TypeError, match="numbers only"):
+        borrow(view)

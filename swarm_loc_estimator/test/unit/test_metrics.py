@@ -1,7 +1,5 @@
 """Error tables against cases worked out by hand, and their statistics against known noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mounts of sensors by static transforms: chains of frames, optical frames, what the description says."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,9 +1,8 @@
 """The dataset's import, on a small folder made here: a robot on a circle among three landmarks."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +15,6 @@ from swarm_loc_estimator.common.messages.poses import decode_odometry, decode_po
 from swarm_loc_estimator.offline.datasets.mrclam import MrclamError, integrate, read_dataset
 from swarm_loc_estimator.swarm.swarm import Face
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 START_S = 1_248_272_272.841
 START_NS = 1_248_272_272_841_000_000

@@ -1,7 +1,5 @@
 """`new` writes descriptions that load, for all types and sensors, by options or by answers."""
 
-from __future__ import annotations
-
 import io
 from itertools import combinations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Odometry that jumps, is reset, or has no pose: what is noticed, what is not believed, what is no fault."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

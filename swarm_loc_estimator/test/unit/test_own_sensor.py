@@ -1,7 +1,5 @@
 """A sensor added from outside the product, that of the example, and the Jacobians of all models."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace

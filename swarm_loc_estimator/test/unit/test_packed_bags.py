@@ -1,8 +1,8 @@
-"""Bags that are compressed as whole files or message by message, and those of other systems."""
+"""Bags and other files: packed ones, outputs, the spool and quality of service."""
 
-from __future__ import annotations
-
+import gc
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,15 +13,21 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from rosbags.typesys import get_types_from_msg
 from test_bags import START, TOPICS, expected, read, some_messages, write_bag, write_mcap, write_sqlite
 
+from bench.shared.full_disk import full_after
 from swarm_loc_estimator.common.bags import reader
 from swarm_loc_estimator.common.bags.bag_file import ReadErrors
-from swarm_loc_estimator.common.bags.reader import BagError, BagReader, unpack_messages
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader, offered_qos, unpack_messages
 from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.files import FileError
+from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder, TransformsEncoder, encode_poses
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.offline.result import Spool
 
 PACK = {".zst": zstandard.compress, ".zstd": zstandard.compress, ".lz4": lz4.frame.compress}
 
@@ -153,3 +159,162 @@ def test_topics_of_another_encoding_are_named_and_the_others_read(tmp_path: Path
     json, ros_1 = losses
     assert json.startswith("x.mcap: the messages on b/odom are serialized as json, not as cdr as in ROS 2;")
     assert "on c/odom, d/odom are serialized as ros1" in ros_1
+
+
+FOREVER = {"sec": 9223372036, "nsec": 854775807}
+NEW = {
+    "history": "keep_last",
+    "depth": 5,
+    "reliability": "best_effort",
+    "durability": "transient_local",
+    "deadline": FOREVER,
+    "lifespan": FOREVER,
+    "liveliness": "automatic",
+    "liveliness_lease_duration": FOREVER,
+    "avoid_ros_namespace_conventions": False,
+}
+OLD = """
+- {history: 1, depth: 5, reliability: 2, durability: 1, deadline: {sec: 0, nsec: 0},
+   lifespan: {sec: 0, nsec: 0}, liveliness: 1, liveliness_lease_duration: {sec: 0, nsec: 0},
+   avoid_ros_namespace_conventions: false}
+"""
+
+
+def _metadata(profiles: object) -> dict[str, Any]:
+    topics = [("/a/odom", profiles), ("/b/odom", "")]
+    return {
+        "topics_with_message_count": [
+            {"message_count": 1, "topic_metadata": {"name": name, "offered_qos_profiles": offered}}
+            for name, offered in topics
+        ]
+    }
+
+
+@pytest.mark.parametrize("profiles", [[NEW], OLD])
+def test_profiles_of_all_versions(profiles: object) -> None:
+    found = offered_qos(_metadata(profiles))
+    (profile,) = found["a/odom"]
+    assert (profile.reliability, profile.durability) == (
+        QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL,
+    )
+    assert profile.depth == 5
+    assert found["b/odom"] == []
+
+
+@pytest.mark.parametrize("damage", ["]", "reliable", [{"depth": 1}], [3], 7, [{**NEW, "deadline": None}]])
+def test_damaged_profiles_are_none(damage: object) -> None:
+    assert offered_qos(_metadata(damage)) == {"b/odom": []}
+
+
+@pytest.mark.parametrize("damage", [None, 7, [None], [{"topic_metadata": 3}], [{"topic_metadata": {}}]])
+def test_damaged_topics_have_none(damage: object) -> None:
+    assert offered_qos({"topics_with_message_count": damage}) == {}
+
+
+def test_rows_come_back_by_key_in_their_order() -> None:
+    rng = np.random.default_rng(1)
+    spool = Spool()
+    parts = {key: [rng.normal(size=(int(rng.integers(0, 3000)), 2, 3)) for _ in range(20)] for key in "ab"}
+    for k in range(20):
+        for key, rows in parts.items():
+            spool.append(key, rows[k])
+    arrays = {key: spool.array(key, np.float64, 2, 3) for key in parts}
+    nothing = spool.array("c", np.int64)
+    del spool
+    for key, rows in parts.items():
+        np.testing.assert_array_equal(arrays[key], np.concatenate(rows))
+    assert nothing.shape == (0,)
+    with pytest.raises(ValueError, match="read-only"):
+        arrays["a"][0] = 0.0
+
+
+def filled(spool: Spool, rows: int) -> None:
+    """Write rows, and read them."""
+    spool.append("a", np.ones(rows))
+    spool.array("a", float)
+
+
+@pytest.mark.parametrize("rows", [20_001, 10])
+def test_a_full_disk_is_said_with_its_folder_and_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rows: int
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    unraised: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", unraised.append)
+    spool = Spool()
+    with full_after(8 * rows - 8):
+        with pytest.raises(FileError, match=f"{tmp_path} cannot be written: File too large"):
+            filled(spool, rows)
+        del spool
+        gc.collect()
+    assert not unraised
+
+
+STAMP_NS = 1_234_567_890_123_456_789
+NAMES = ["a", "robot17", "x" * 40]
+POSES = np.array([[1.0, 2.0, 0.3], [-4.0, 5.0, -3.0], [np.nan, np.nan, np.nan]])
+COVARIANCES = np.arange(27.0).reshape(3, 3, 3)
+
+
+def read_outputs(data: bytes, message_type: str) -> Any:
+    """The message object; equal to the bytes again when serialized, so nothing is missing or too much."""
+    store = typestore()
+    if message_type not in store.fielddefs:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", message_type))
+    message = store.deserialize_cdr(data, message_type)
+    assert bytes(store.serialize_cdr(message, message_type)).rstrip(b"\x00") == data.rstrip(b"\x00")
+    return message
+
+
+def stamp_ns(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def yaw(quaternion: Any) -> float:
+    assert quaternion.x == quaternion.y == 0.0
+    return float(2.0 * np.arctan2(quaternion.z, quaternion.w))
+
+
+@pytest.mark.parametrize("frame", ["map", "world", ""])
+def test_swarm_poses(frame: str) -> None:
+    encoder = SwarmPosesEncoder(NAMES, frame)
+    ages, status = np.array([0.5, 1.5, -1.0]), np.array([1, 2, 0], np.uint8)
+    known = np.array([False, True, False])
+    for stamp in (5, STAMP_NS):
+        message = read_outputs(
+            encoder.encode(stamp, POSES, COVARIANCES, ages, status, known), "swarm_loc_msgs/msg/SwarmPoses"
+        )
+        assert (stamp_ns(message), message.header.frame_id) == (stamp, frame)
+    assert [robot.name for robot in message.robots] == NAMES
+    for k, robot in enumerate(message.robots):
+        assert np.array_equal([robot.x, robot.y, robot.theta], POSES[k], equal_nan=True)
+        assert np.array_equal(robot.covariance, COVARIANCES[k].ravel())
+        assert (robot.fix_age_s, robot.status, robot.heading_known) == (ages[k], status[k], known[k])
+
+
+def test_robot_poses_are_sure_of_the_plane_but_not_beyond_doubt() -> None:
+    messages = encode_poses("map", np.full(2, STAMP_NS), POSES[:2], COVARIANCES[:2])
+    for k, data in enumerate(messages):
+        message = read_outputs(data, "geometry_msgs/msg/PoseWithCovarianceStamped")
+        assert (stamp_ns(message), message.header.frame_id) == (STAMP_NS, "map")
+        place = message.pose.pose.position
+        assert (place.x, place.y, place.z) == (*POSES[k, :2], 0.0)
+        assert yaw(message.pose.pose.orientation) == pytest.approx(POSES[k, 2])
+        covariance = np.array(message.pose.covariance).reshape(6, 6)
+        assert np.array_equal(covariance[np.ix_((0, 1, 5), (0, 1, 5))], COVARIANCES[k])
+        assert (np.diagonal(covariance)[2:5] > 0.0).all()
+        assert not covariance[2:5, [0, 1, 5]].any()
+
+
+def test_transforms_of_those_that_are_chosen() -> None:
+    encoder = TransformsEncoder("map", [f"{name}/odom" for name in NAMES])
+    for chosen in ([True, False, False], [True, True, False], [False, True, False]):
+        data = encoder.encode(STAMP_NS, np.array(chosen), POSES)
+        transforms = read_outputs(data, "tf2_msgs/msg/TFMessage").transforms
+        rows = np.flatnonzero(chosen)
+        assert [t.child_frame_id for t in transforms] == [f"{NAMES[row]}/odom" for row in rows]
+        for row, transform in zip(rows, transforms, strict=True):
+            assert (stamp_ns(transform), transform.header.frame_id) == (STAMP_NS, "map")
+            assert transform.transform.translation.x == POSES[row, 0]
+            assert yaw(transform.transform.rotation) == pytest.approx(POSES[row, 2])

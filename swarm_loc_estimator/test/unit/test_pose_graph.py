@@ -1,7 +1,5 @@
 """The pose graph: Jacobians of constraints, sparse normal equations beside dense ones, covariances."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """`new BAG` describes what a recording shows: the description replays, and what it says is right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """The public Python API: its names, what importing one of them loads, its page, its example."""
 
-from __future__ import annotations
-
 import ast
 import math
 import os

@@ -1,7 +1,5 @@
 """Other robots in the scans of a lidar: what may be one, and what sightings of located ones tell."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Schedules of the runner: which poses a recording gets."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from swarm_loc_estimator.offline.replay import ListedSchedule, PeriodicSchedule, Runner

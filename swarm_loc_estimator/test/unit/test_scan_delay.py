@@ -1,7 +1,5 @@
 """Delays of lidars: which lag agrees with odometry, what none tells, and poses by all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,13 +1,11 @@
 """Sway and noise of cameras are told apart by what different markers have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.models import with_noise
-from swarm_loc_estimator.offline.calibration.scatter import sway_of
+from swarm_loc_estimator.offline.calibration.sightings import sway_of
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

@@ -1,7 +1,5 @@
 """The JSON Schema of swarm descriptions accepts and refuses what `load_swarm` does."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

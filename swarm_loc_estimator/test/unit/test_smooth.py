@@ -1,7 +1,5 @@
 """Smoothing: Jacobians, errors and covariances against the truth, recordings without a solution."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,13 +18,15 @@ from swarm_loc_estimator.cli import replay as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.batch.lasting import with_lasting_errors
 from swarm_loc_estimator.offline.batch.normal import ChainEquations
-from swarm_loc_estimator.offline.batch.parameters import SURVEY
-from swarm_loc_estimator.offline.batch.problem import BatchProblem, problem_of
-from swarm_loc_estimator.offline.batch.smooth import SmoothError, covariances_at, smooth_recording
-from swarm_loc_estimator.offline.batch.solver import Solver
-from swarm_loc_estimator.offline.batch.start import Start, on_paths
+from swarm_loc_estimator.offline.batch.problem import SURVEY, BatchProblem, opened, problem_of
+from swarm_loc_estimator.offline.batch.smooth import (
+    SmoothError,
+    covariances_at,
+    smooth_recording,
+    with_lasting_errors,
+)
+from swarm_loc_estimator.offline.batch.solver import Solver, Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import unwatched
@@ -295,6 +295,28 @@ def run(recording: Recording, swarm: Swarm) -> ReplayResult:
     runner.take(Batch.of(*recording.range_ns, **in_order))
     runner.finish(recording.range_ns[1])
     return runner.result(recording.name, recording.range_ns, recording.truth, {})
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.06])
+def test_a_landmark_that_is_opened_online_is_so_in_the_batch_if_it_has_moved(moved: float) -> None:
+    squares = {name: list[float]() for name in ("exact", "opened", "as it is")}
+    for seed in range(2):
+        world = simulate(PLAN, seed)
+        recording, swarm = with_sightings(world, seed)
+        first, *others = swarm.landmarks
+        described = replace(swarm, landmarks=(replace(first, x=first.x + moved), *others))
+        learned = replace(described, landmarks=(opened(described.landmarks[0]), *others))
+        cases = ((described, None), (described, learned), (swarm, None))
+        for name, (one, now) in zip(squares, cases, strict=True):
+            online = replace(run(recording, one), self_calibrated=now)
+            error, _ = errors_of(smooth_recording(recording, online), world)
+            squares[name] += np.sum(error[:, :2] ** 2, axis=1).tolist()
+    exact, found, right = (float(np.mean(one)) for one in squares.values())
+    if moved:
+        assert found < 0.5 * (exact + right)
+        assert found < 1.3 * right
+    else:
+        assert found == pytest.approx(exact, rel=1e-3)
 
 
 def test_covariances_are_those_of_many_worlds() -> None:

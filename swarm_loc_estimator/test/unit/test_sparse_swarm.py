@@ -1,7 +1,5 @@
 """Small swarms in the sparse filter: who joins, is lost, found, contradicted, named, as in the dense one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

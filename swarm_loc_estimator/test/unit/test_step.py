@@ -1,7 +1,5 @@
 """`Estimator.step`: seconds of readings in one call give the poses of a replay; what is wrong is named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

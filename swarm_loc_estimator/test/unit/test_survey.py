@@ -1,7 +1,5 @@
 """Surveying landmarks: places, covariances and frames against the truth; wrong ids, lone parts, sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +17,8 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.batch.parameters import SURVEY
-from swarm_loc_estimator.offline.batch.problem import problem_of
-from swarm_loc_estimator.offline.batch.solver import Solver
-from swarm_loc_estimator.offline.batch.start import start_of
+from swarm_loc_estimator.offline.batch.problem import SURVEY, problem_of
+from swarm_loc_estimator.offline.batch.solver import Solver, start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, read_recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.survey.survey import survey

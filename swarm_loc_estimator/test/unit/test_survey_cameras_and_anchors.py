@@ -1,7 +1,5 @@
 """Fixed cameras and anchors: robots on a line or at one place cannot place them; variances of few stamps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from core_messages import detection, joined

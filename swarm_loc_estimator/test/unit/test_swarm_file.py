@@ -1,17 +1,38 @@
 """The swarm description: layers, round trip, and one sentence for whatever is wrong with a file."""
 
-from __future__ import annotations
-
 import math
+import string
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm, SwarmError
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.swarm import ir_board
+from swarm_loc_estimator.swarm.error_models import (
+    ClockModel,
+    FixModel,
+    MotionResponse,
+    OdometryModel,
+    RandomWalk,
+    SensorModel,
+)
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
+from swarm_loc_estimator.swarm.swarm import (
+    Anchor,
+    CameraMount,
+    Face,
+    FixedCamera,
+    Landmark,
+    Robot,
+    StartSigma,
+    Swarm,
+    SwarmError,
+    UwbDevice,
+)
+from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, SwarmFileError, load_swarm, save_swarm
 
 EXAMPLE = """\
 fileversion: 1
@@ -118,21 +139,9 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        (
-            "wheel_separation: 0.053",
-            "wheel_separation: -1",
-            "types.epuck.odometry.wheel_separation is -1 but must lie in [0.001, 10] m.",
-        ),
-        (
-            "wheel_separation: 0.053",
-            "wheel_separation: .nan",
-            "types.epuck.odometry.wheel_separation is nan but must lie in [0.001, 10] m.",
-        ),
-        (
-            "wheel_separation: 0.053",
-            "wheel_separation: -.inf",
-            "types.epuck.odometry.wheel_separation is -inf but must lie in [0.001, 10] m.",
-        ),
+        ("on: 0.053", "on: -1", "types.epuck.odometry.wheel_separation is -1 but must lie in [0.001, 10] m."),
+        (": 0.053", ": .nan", "types.epuck.odometry.wheel_separation is nan but must lie in [0.001, 10] m."),
+        (" 0.053", " -.inf", "types.epuck.odometry.wheel_separation is -inf but must lie in [0.001, 10] m."),
         (
             "wheel_separation: 0.053",
             "wheel_separation: true",
@@ -177,22 +186,10 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
             "robots.two.ids.front is 3.5 but must be a marker id, a whole number in [0, 4294967295].",
         ),
         ("front: 3", "frnt: 3", "'robots.two.ids.frnt' is not a known key; the nearest one is 'front'."),
-        (
-            "front: 1, back: 2",
-            "front: 1",
-            "robots.one.ids has no id for face 'back'; give one or set faces.back to null.",
-        ),
-        (
-            "  101:",
-            "  abc:",
-            "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295].",
-        ),
+        ("1, back: 2", "1", "robots.one.ids has no id for face 'back'; give one or set faces.back to null."),
+        ("101", "abc", "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295]."),
         ("  101: {x: 0, y: 0", "  100: {x: 0, y: 0", "'100' is given twice, again in line 30."),
-        (
-            "{position_sigma: 0.02}",
-            "{x: 0.02}",
-            "'defaults.landmark.x' is not a known key; the nearest one is 'yaw_sigma'.",
-        ),
+        ("position_sigma", "x", "'defaults.landmark.x' is not a known key; the nearest one is 'yaw_sigma'."),
         (
             "{position_sigma: 0.02}",
             "{yaw_sigma: -1}",
@@ -200,11 +197,7 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
         ),
         ("size: 0.08", "size: 0.0", "landmarks.100.size is 0.0 but must lie in [0.001, 10] m."),
         ("  101: {x: 0, y: 0", "  101: {x: 0", "landmarks.101 lacks y, a number in [-1e+08, 1e+08] m."),
-        (
-            "y: -2.5, theta: 0.5",
-            "y: -2.5",
-            "robots.one.start lacks theta, a number in [-6.2832, 6.2832] rad.",
-        ),
+        ("y: -2.5, theta: 0.", "y: -2.", "robots.one.start lacks theta, a number in [-6.2832, 6.2832] rad."),
         (
             "  three:",
             "  2three:",
@@ -326,11 +319,309 @@ def test_mutated_files_load_or_say_one_sentence(tmp_path: Path, data: st.DataObj
 
 
 def test_an_imu_needs_odometry(tmp_path: Path) -> None:
-    path = tmp_path / "swarm.yaml"
-    path.write_text(
-        "fileversion: 1\nrobots: {a: {odometry: null, camera: null, imu: {turn_noise_density: 0.01}}}\n"
+    text = "fileversion: 1\nrobots: {a: {odometry: null, camera: null, imu: {turn_noise_density: 0.01}}}\n"
+    said = "robot 'a' has no odometry, so its imu.turn_noise_density must be 0"
+    assert said in error_of(tmp_path, text)
+
+
+EXAMPLE_CAMERAS = """\
+fileversion: 1
+types:
+  puck: {faces: {top: {z: 0.1, yaw: 0.5, lies: true}, side: {yaw: 0.0}}}
+robots:
+  a: {type: puck, ids: {top: 4, side: 5}}
+  b: {type: puck, faces: {side: null, top: {lies: false}}, ids: {top: 6}}
+cameras:
+  up: {x: 1.0, y: 2.0, z: 2.5, yaw: 0.1, sensor: {residual_position_sigma: 0.002}}
+  wall: {x: 0.0, y: 2.0, z: 1.0, pitch: 0.6, roll: 0.1, position_sigma: 0.004, yaw_sigma: 0.01}
+"""
+
+
+def test_fixed_cameras_and_lying_faces_are_read_and_written(tmp_path: Path) -> None:
+    swarm = load(tmp_path, EXAMPLE_CAMERAS)
+    up = FixedCamera("up", 1.0, 2.0, 2.5, 0.1, math.pi / 2, sensor=SensorModel(residual_position_sigma=0.002))
+    assert swarm.cameras == (up, FixedCamera("wall", 0.0, 2.0, 1.0, 0.0, 0.6, 0.1, 0.004, 0.01))
+    assert swarm.robots[0].faces == (Face("top", 4, z=0.1, yaw=0.5, lies=True), Face("side", 5, yaw=0.0))
+    assert swarm.robots[1].faces == (Face("top", 6, z=0.1, yaw=0.5),)
+    save_swarm(swarm, tmp_path / "again.yaml")
+    assert load_swarm(tmp_path / "again.yaml") == swarm
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (", z: 2.5", "", "cameras.up lacks z"),
+        ("z: 2.5", "z: .nan", "cameras.up.z is nan but must lie in [-10000, 10000] m"),
+        ("osition_sigma: 0.004", "osition_sigma: 0.0", "cameras.wall.position_sigma is 0.0 but must lie in"),
+        ("z: 2.5", "height: 2.5", "'cameras.up.height' is not a known key"),
+        ("residual_position_sigma", "noise", "'cameras.up.sensor.noise' is not a known key"),
+        ("  wall:", "  up:", "'up' is given twice"),
+        ("  wall:", "  aerial:", "a name in cameras is 'aerial' but must be none of"),
+        ("  wall:", "  a b:", "a name in cameras is 'a b' but must be letters"),
+        ("  wall:", "  a:", "name 'a' is given to two robots or cameras, which must differ by more"),
+        ("  wall:", "  UP:", "name 'up' is given to two robots or cameras"),
+        ("  wall:", "  A:", "name 'a' is given to two robots or cameras"),
+        ("lies: true", "lies: 1", "types.puck.faces.top.lies is 1 but must be true or false"),
+        ("  up: {", "  up: 3 # {", "cameras.up is 3 but must be a mapping"),
+    ],
+)
+def test_a_wrong_camera_is_named_in_one_sentence(old: str, new: str, said: str, tmp_path: Path) -> None:
+    assert said in error_of(tmp_path, EXAMPLE_CAMERAS.replace(old, new, 1))
+
+
+PACKAGED_DROPLET = Path(ir_board.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
+IR = """\
+fileversion: 1
+types:
+  droplet:
+    odometry: null
+    camera: null
+    ir: {platform: droplet, gate_probability: 0.99}
+robots:
+  one: {type: droplet, ir: {id: 0xDF64}}
+  two:
+    type: droplet
+    odometry: {wheel_noise: 0.01}
+    ir: {id: 7, gains: {sensor: [1, 1, 1, 1, 1, 2], emitter: [1, 1, 1, 1, 1, 0.5]}}
+  three: {type: droplet, ir: null}
+  four: {ir: {id: 8, platform: board.yaml}}
+"""
+
+
+def load_ir(folder: Path, text: str) -> Swarm:
+    (folder / "board.yaml").write_text(PACKAGED_DROPLET.read_text())
+    return load(folder, text)
+
+
+def test_infrared_boards_come_from_their_layers(tmp_path: Path) -> None:
+    one, two, three, four = load_ir(tmp_path, IR).robots
+    assert (one.stands, two.stands, four.stands) == (True, False, False)
+    assert two.odometry.wheel_noise == 0.01
+    platform = load_ir_platform("droplet")
+    assert one.ir == RobotIr(0xDF64, platform, "droplet", gate_probability=0.99)
+    assert two.ir is not None
+    assert two.ir.gate_probability == 0.99
+    assert two.ir.believed_gains == IrGains((1, 1, 1, 1, 1, 2), (1, 1, 1, 1, 1, 0.5))
+    assert one.ir.believed_gains == IrGains.unknown(platform)
+    assert three.ir is None
+    assert four.ir == RobotIr(8, platform, str(tmp_path / "board.yaml"))
+
+
+def test_infrared_boards_are_written_and_read_back_also_elsewhere(tmp_path: Path) -> None:
+    swarm = load_ir(tmp_path, IR)
+    for folder in (tmp_path, tmp_path / "deeper"):
+        folder.mkdir(exist_ok=True)
+        save_swarm(swarm, folder / "again.yaml")
+        assert load_swarm(folder / "again.yaml") == swarm
+    assert "platform: ../board.yaml" in (tmp_path / "deeper" / "again.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("0xDF64", "0", "robots.one.ir.id is 0 but must be a whole number in [1, 65535]."),
+        ("0xDF64", "0x1DF64", "robots.one.ir.id is '0x1DF64' but must be a whole number in [1, 65535]."),
+        ("0xDF64", "true", "robots.one.ir.id is True but must be a whole number in [1, 65535]."),
+        ("0xDF64", "7", "ir.id 7 belongs to both robot 'one' and robot 'two'; ids must be unique."),
+        (": droplet, ir: {id: 0xDF64}", ": droplet", "robots.one.ir lacks id, a whole number in [1, 65535]."),
+        (
+            "platform: droplet, ",
+            "",
+            "robots.one.ir lacks platform, the name of a packaged one or the path of a file.",
+        ),
+        (
+            "platform: droplet, ",
+            "id: 3, ",
+            "'types.droplet.ir.id' is not a known key; the nearest one is 'gains'.",
+        ),
+        (
+            "platform: droplet",
+            "platform: 5",
+            "types.droplet.ir.platform is 5 but must be the name of a packaged one or the path of a file.",
+        ),
+        (
+            "id: 7",
+            "id: 7, estimator: closed_form",
+            (
+                "robots.two.ir.estimator is no longer an option:"
+                " poses are always estimated by likelihood; remove it."
+            ),
+        ),
+        ("bability: 0.99", "bability: 0", "types.droplet.ir.gate_probability is 0 but must lie in [0.5, 1]."),
+        (", 1, 1, 2", ", 1, 1, 90", "robots.two.ir.gains.sensor has 90 but factors must lie in [0.05, 20]."),
+        ("[1, 1, 1, 1, 1, 2]", "[1, a]", "robots.two.ir.gains.sensor[1] is 'a' but must be a number."),
+        (
+            "[1, 1, 1, 1, 1, 2], emitter: [1, 1, 1, 1, 1, 0.5]",
+            "[1], emitter: [1]",
+            "robots.two.ir.gains has 1 sensors and emitters but must have the 6 of its platform.",
+        ),
+        ("sensor: [1, 1, 1, 1, 1, 2], ", "", "robots.two.ir.gains lacks sensor."),
+    ],
+)
+def test_one_sentence_says_what_is_wrong_with_a_board(
+    tmp_path: Path, old: str, new: str, sentence: str
+) -> None:
+    assert old in IR
+    (tmp_path / "board.yaml").write_text(PACKAGED_DROPLET.read_text())
+    assert error_of(tmp_path, IR.replace(old, new, 1)) == sentence
+
+
+def test_a_platform_file_that_is_missing_or_wrong_is_named(tmp_path: Path) -> None:
+    assert "robots.four.ir.platform: " in (sentence := error_of(tmp_path, IR))
+    assert "board.yaml cannot be read" in sentence
+    (tmp_path / "board.yaml").write_text(PACKAGED_DROPLET.read_text().replace("radius: 0.022", "radius: -1"))
+    assert "board.yaml: radius is -1 but must lie in" in error_of(tmp_path, IR)
+    sentence = error_of(tmp_path, IR.replace("platform: droplet", "platform: dropet"))
+    assert sentence.startswith("types.droplet.ir.platform: 'dropet' is no packaged infrared platform (")
+
+
+DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
+HUGE = 2**64 - 1
+ADDRESS = "a whole number in [1, 18446744073709551615]"
+DESCRIPTION = """\
+fileversion: 1
+types:
+  rover: {camera: null, uwb: {x: 0.1, z: 0.4, range_sigma: 0.05}}
+robots:
+  a: {type: rover, uwb: {address: 0x1F, range_bias: -0.02}}
+  b: {type: rover, uwb: {address: 18446744073709551615}}
+  c: {type: rover, uwb: null}
+anchors:
+  - {address: 7, x: 0.0, y: 5.0, z: 2.5}
+  - {address: 0x10, x: 5.0, y: 5.0, position_sigma: 0.05}
+"""
+
+
+def test_a_description_is_read_and_written_back(tmp_path: Path) -> None:
+    path, swarm = tmp_path / "swarm.yaml", load(tmp_path, DESCRIPTION)
+    assert [robot.uwb for robot in swarm.robots] == [
+        UwbDevice(31, 0.1, 0.0, 0.4, 0.05, range_bias=-0.02),
+        UwbDevice(HUGE, 0.1, 0.0, 0.4, 0.05),
+        None,
+    ]
+    assert swarm.anchors == (Anchor(7, 0.0, 5.0, 2.5), Anchor(16, 5.0, 5.0, position_sigma=0.05))
+    save_swarm(swarm, path)
+    assert load_swarm(path) == swarm
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("ess: 7", "ess: 31", "uwb.address 31 belongs to both robot 'a' and anchors[0]; ids must be unique."),
+        ("address: 7, ", "", f"anchors[0] lacks address, {ADDRESS}."),
+        ("address: 7", "address: 0", f"anchors[0].address is 0 but must be {ADDRESS}."),
+        ("address: 7", "address: '0x0'", f"anchors[0].address is '0x0' but must be {ADDRESS}."),
+        ("address: 7", "address: 1.5", f"anchors[0].address is 1.5 but must be {ADDRESS}."),
+        ("address: 0x1F, ", "", f"robots.a.uwb lacks address, {ADDRESS}."),
+        ("y: 5.0, z: 2.5", "z: 2.5", "anchors[0] lacks y, a number in [-1e+08, 1e+08] m."),
+        ("x: 0.0", "x: .nan", "anchors[0].x is nan but must lie in [-1e+08, 1e+08] m."),
+        ("sigma: 0.05", "sigma: 0", "types.rover.uwb.range_sigma is 0 but must lie in (0, 10] m."),
+        (
+            "{x: 0.1",
+            "{address: 3, x: 0.1",
+            "'types.rover.uwb.address' is not a known key; the nearest one is 'range_bias'.",
+        ),
+    ],
+)
+def test_a_mistake_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert error_of(tmp_path, DESCRIPTION.replace(old, new, 1)) == sentence
+
+
+def test_the_example_of_the_page_is_a_description(tmp_path: Path) -> None:
+    text = DOC.read_text(encoding="utf-8").split("```yaml\n")[1].partition("```")[0]
+    swarm = load(tmp_path, text)
+    assert all(robot.uwb for robot in swarm.robots)
+    assert len(swarm.anchors) == 4
+
+
+RESPONSE = MotionResponse(
+    (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2
+)
+DROPLET = load_ir_platform("droplet")
+
+
+def numbers(cls: type) -> st.SearchStrategy[dict[str, Any]]:
+    options = {
+        name: st.floats(spec.low, min(spec.high, 1e6), exclude_min=spec.above)
+        | (st.none() if spec.optional else st.nothing())
+        for name, spec in number_specs(cls).items()
+    }
+    return st.fixed_dictionaries({}, optional=options)
+
+
+def build(cls: type) -> st.SearchStrategy[Any]:
+    return numbers(cls).map(lambda values: cls(**values))
+
+
+def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
+    gain = st.tuples(*[st.floats(0.05, 20.0)] * 6)
+    return st.builds(
+        RobotIr,
+        st.just(board_id),
+        st.just(DROPLET),
+        st.just("droplet"),
+        st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+        gate_probability=st.floats(0.5, 1.0),
     )
-    with pytest.raises(
-        SwarmFileError, match=r"robot 'a' has no odometry, so its imu.turn_noise_density must be 0"
-    ):
-        load_swarm(path)
+
+
+@st.composite
+def swarms(draw: st.DrawFn) -> Swarm:
+    ids = iter(draw(st.lists(st.integers(0, 2**32 - 1), unique=True, min_size=40, max_size=40)))
+    names = draw(
+        st.lists(
+            st.text(string.ascii_letters, min_size=1, max_size=6).filter(lambda n: n not in RESERVED_NAMES),
+            unique=True,
+            min_size=1,
+            max_size=4,
+        )
+    )
+    robots: list[Robot] = []
+    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, ClockModel, StartSigma)
+    pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
+    face_numbers = draw(st.lists(numbers(Face), max_size=3))
+    for name in names:
+        faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
+        stands = draw(st.booleans())
+        robots.append(
+            Robot(
+                name,
+                draw(st.sampled_from(["", "typ", "other"])),
+                odometry=OdometryModel() if stands else draw(st.sampled_from(pool[OdometryModel])),
+                response=draw(st.sampled_from([None, RESPONSE])),
+                camera=draw(st.sampled_from([*pool[CameraMount], None])),
+                sensor=draw(st.sampled_from(pool[SensorModel])),
+                faces=faces[: draw(st.integers(0, 3))],
+                start=draw(
+                    st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
+                ),
+                fix=draw(st.sampled_from(pool[FixModel])),
+                clock=draw(st.sampled_from(pool[ClockModel])),
+                start_sigma=draw(st.sampled_from(pool[StartSigma])),
+                stands=stands,
+                random_walk=draw(st.sampled_from(pool[RandomWalk])) if stands else RandomWalk(),
+                ir=draw(st.none() | boards(len(robots) + 1)),
+            )
+        )
+    landmarks = tuple(
+        Landmark(next(ids), **values) for values in draw(st.lists(numbers(Landmark), max_size=4))
+    )
+    return Swarm(tuple(robots), landmarks)
+
+
+@RELAXED
+@given(swarm=swarms())
+def test_what_is_written_is_read_back(tmp_path: Path, swarm: Swarm) -> None:
+    save_swarm(swarm, tmp_path / "swarm.yaml", "a comment\nof two lines")
+    assert load_swarm(tmp_path / "swarm.yaml") == swarm
+
+
+def test_written_file_says_shared_things_once(tmp_path: Path) -> None:
+    model = OdometryModel(distance_scale=0.9)
+    robots = tuple(
+        Robot(name, "typ", model, sensor=SensorModel(bearing_offset=k)) for k, name in enumerate("ab")
+    )
+    save_swarm(Swarm(robots), tmp_path / "swarm.yaml")
+    text = (tmp_path / "swarm.yaml").read_text()
+    assert text.count("distance_scale: 0.9") == 1
+    assert "bearing_offset [rad]" in text

@@ -1,7 +1,5 @@
 """Sweeps: the grid, what is refused, resumed runs, failed jobs, the same table from any number of workers."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

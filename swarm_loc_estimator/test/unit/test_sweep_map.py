@@ -1,7 +1,5 @@
 """Maps by lidars: correlative matches, loops, odometry that says nothing, and robots with unknown starts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,7 +11,7 @@ from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match,
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.scans import Scan, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.sweep_map import LoopTie
+from swarm_loc_estimator.mapping.sweep_map import LoopTie, SweepMap
 
 REACH, NOISE, STEP_NS = 8.0, 0.01, 1_000_000_000
 SIGMA = NOISE / REACH**2
@@ -165,6 +163,30 @@ def test_loops_that_contradict_the_others_are_taken_back(seed: int) -> None:
     assert mapper.sweeps.loops == [*loops, *right]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_last_solution_ties_what_was_seen_at_other_times(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where no loop was closed; another one changes nothing."""
+    monkeypatch.setattr(SweepMap, "_close_loops", lambda *_: None)
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    half = mapper.graph.count // 2
+
+    def apart() -> float:
+        """How far the laps are off each other, which both are off the truth [m]."""
+        error = mapper.graph.poses[:, :2] - truth[:, :2]
+        return float(np.hypot(*(error[half : 2 * half] - error[:half]).T).mean())
+
+    before = apart()
+    mapper.finish()
+    after, poses = apart(), mapper.graph.poses.copy()
+    assert after < 0.2 * before
+    mapper.finish()
+    assert mapper.graph.poses == pytest.approx(poses, abs=2e-3)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_what_scores_less_than_is_of_use_is_not_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -229,6 +251,13 @@ def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() ->
     assert located.pose[:2] == pytest.approx(between(laps(1.0)[0], path[-1])[:2], abs=0.25)
     assert off(mapper, first, truth).max() < 0.25
     assert cells > 500
+
+
+def test_stops_without_a_sweep_are_taken_back_wherever_they_are_in_the_graph() -> None:
+    mapper = CooperativeMapper()
+    for node in (0, 1000):
+        mapper.sweeps.drop(node)
+    assert not mapper.sweeps.drawn
 
 
 def test_a_full_graph_locates_robots_without_growing() -> None:

@@ -1,7 +1,5 @@
 """Measurements are thinned out evenly, odometry never, and the same way every time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

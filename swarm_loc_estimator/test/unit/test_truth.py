@@ -1,7 +1,5 @@
 """Ground truth: by robot, in order of its stamps, of all usual message types."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bench.shared.bags import copy_part, read_truth
 from swarm_loc_estimator.cli.replay import main
-from swarm_loc_estimator.common.bags.reader import BagError, BagReader
+from swarm_loc_estimator.common.bags.reader import BagError
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.recording import read_recording
@@ -70,12 +68,13 @@ def converted(data: bytes, message_type: str) -> bytes:
 
 def rewritten(bag: Path, source: Path, types: Sequence[str]) -> Path:
     """A bag whose robots have ground truth of these types."""
-    with BagReader(source) as reader, BagWriter(bag) as writer:
-        type_of = {f"epuck{number}/ground_truth": name for number, name in enumerate(types, 1)}
-        for topic in reader.topics:
-            writer.add_topic(topic.name, type_of.get(topic.name, topic.type))
-        for name, _, log_ns, data in reader.messages():
-            writer.write(name, log_ns, converted(data, type_of[name]) if name in type_of else data)
+    type_of = {f"epuck{number}/ground_truth": name for number, name in enumerate(types, 1)}
+    copy_part(
+        source,
+        bag,
+        rename=lambda name, kind: (name, type_of.get(name, kind)),
+        change=lambda name, at, data: (at, converted(data, type_of[name]) if name in type_of else data),
+    )
     return bag
 
 
@@ -121,15 +120,9 @@ def test_malformed_truth_is_named(tmp_path: Path) -> None:
     assert summary.truth["a"].stamp_ns.tolist() == [10, 10]
 
 
-def renamed(bag: Path, source: Path, rename: Callable[[str, str, bytes], tuple[str, str, bytes]]) -> Path:
-    """A bag with other names, types or messages."""
-    with BagReader(source) as reader, BagWriter(bag) as writer:
-        for topic in reader.topics:
-            name, message_type, _ = rename(topic.name, topic.type, b"")
-            writer.add_topic(name, message_type)
-        for name, message_type, log_ns, data in reader.messages():
-            new, _, changed = rename(name, message_type, data)
-            writer.write(new, log_ns, changed)
+def renamed(bag: Path, source: Path, rename: Callable[[str, str], tuple[str, str]]) -> Path:
+    """A bag with other names or types."""
+    copy_part(source, bag, rename=rename)
     return bag
 
 
@@ -144,9 +137,9 @@ def test_a_bag_with_other_topics_fails_and_names_the_candidates(
 ) -> None:
     names = {"odom": "odometry/filtered", "detections": "markers", "ground_truth": "ground_truth"}
 
-    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+    def rename(topic: str, message_type: str) -> tuple[str, str]:
         robot, name = topic.split("/")
-        return f"{robot}/{names[name]}", message_type, data
+        return f"{robot}/{names[name]}", message_type
 
     bag = renamed(tmp_path / "bag", short, rename)
     first, odometry, detections = error_of(capsys, bag, tmp_path / "out")
@@ -196,8 +189,8 @@ def test_a_bag_of_ros_1_or_json_fails_and_says_so(
 def test_messages_of_another_type_are_not_read(
     tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
-        return topic, POSE_STAMPED if topic.endswith("/odom") else message_type, data
+    def rename(topic: str, message_type: str) -> tuple[str, str]:
+        return topic, POSE_STAMPED if topic.endswith("/odom") else message_type
 
     bag = renamed(tmp_path / "bag", short, rename)
     error_of(capsys, bag, tmp_path / "out")
@@ -214,8 +207,8 @@ def test_messages_of_another_type_are_not_read(
 def test_mapped_topics_give_the_same_poses(
     tmp_path: Path, short: Path, remap: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
-        return topic.replace("/odom", "/odometry/filtered"), message_type, data
+    def rename(topic: str, message_type: str) -> tuple[str, str]:
+        return topic.replace("/odom", "/odometry/filtered"), message_type
 
     swarm = load_swarm(DEMO / "swarm.yaml")
     remap = remap or {f"{r.name}/odom": f"{r.name}/odometry/filtered" for r in swarm.robots}
@@ -231,14 +224,15 @@ def test_mapped_topics_give_the_same_poses(
 
 
 def test_a_clock_that_is_behind_is_named_and_its_description_corrects_it(tmp_path: Path, short: Path) -> None:
-    def delay(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
-        if not data or topic not in ("epuck2/odom", "epuck2/detections"):
-            return topic, message_type, data
+    def delay(topic: str, log_ns: int, data: bytes) -> tuple[int, bytes]:
+        if topic not in ("epuck2/odom", "epuck2/detections"):
+            return log_ns, data
         sec, nanosec = struct.unpack_from("<iI", data, 4)
         stamp = divmod(sec * 10**9 + nanosec - 3 * 10**8, 10**9)
-        return topic, message_type, data[:4] + struct.pack("<iI", *stamp) + data[12:]
+        return log_ns, data[:4] + struct.pack("<iI", *stamp) + data[12:]
 
-    swarm, bag = load_swarm(DEMO / "swarm.yaml"), renamed(tmp_path / "bag", short, delay)
+    swarm, bag = load_swarm(DEMO / "swarm.yaml"), tmp_path / "bag"
+    copy_part(short, bag, change=delay)
     (remark,) = replay(bag, swarm).remarks
     assert remark.startswith("epuck2 has a clock 0.3 s behind those of the other robots. Synchronize")
     assert remark.endswith("or set clock.offset_s to -0.3.")
@@ -295,8 +289,8 @@ def test_a_rule_that_is_none_is_refused(rule: str, capsys: pytest.CaptureFixture
 def test_a_replay_that_locates_nobody_fails(
     tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
-        return topic.replace("/odom", "/odometry/filtered"), message_type, data
+    def rename(topic: str, message_type: str) -> tuple[str, str]:
+        return topic.replace("/odom", "/odometry/filtered"), message_type
 
     bag = renamed(tmp_path / "bag", short, rename)
     assert error_of(capsys, bag, tmp_path / "out")[-1].startswith("No robot was located at any time")

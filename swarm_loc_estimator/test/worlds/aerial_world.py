@@ -1,7 +1,5 @@
 """Swarms seen from above for the tests of the core: odometry, and anonymous detections of aerial images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

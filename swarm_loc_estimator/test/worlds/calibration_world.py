@@ -1,7 +1,5 @@
 """A small world with known models, as a recording in memory."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

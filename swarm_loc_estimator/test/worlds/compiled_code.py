@@ -1,7 +1,5 @@
 """What the tests of warming up share: what has been compiled by now, in a process of its own."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

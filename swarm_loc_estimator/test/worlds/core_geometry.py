@@ -1,7 +1,5 @@
 """Frames, poses and their errors for the tests of the core, written independently of the code under test."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

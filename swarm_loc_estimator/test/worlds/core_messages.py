@@ -1,7 +1,5 @@
 """Messages for the tests of the core."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Runs of the core in tests: messages handed in as they arrive, ticks, and what became of it all."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable
 
 import numpy as np

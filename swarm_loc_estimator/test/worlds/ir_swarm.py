@@ -1,7 +1,5 @@
 """A small swarm of Droplets that light their emitters in turn, and what the others read of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

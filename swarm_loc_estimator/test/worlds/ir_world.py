@@ -1,7 +1,5 @@
 """The Droplet paper's equations once more, written as printed in plain numpy, and random pairs of robots."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

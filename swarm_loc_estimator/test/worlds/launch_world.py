@@ -3,8 +3,6 @@
 As a program it does what `ros2 launch FILE NAME:=VALUE...` does.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -7,8 +7,6 @@ SOCKET, after DELAY_S and up to JITTER_S more, but for a share LOSS of it; what 
 device. The kernel's own means for it, netem, is missing on many machines.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import heapq

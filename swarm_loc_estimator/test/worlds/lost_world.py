@@ -1,7 +1,5 @@
 """Small swarms in which a robot is lost, one for each reason, run as `replay` runs them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby

@@ -3,8 +3,6 @@
 Each is a network namespace. Multicast does not pass the router.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

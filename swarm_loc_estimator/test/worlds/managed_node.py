@@ -1,7 +1,5 @@
 """A client of the lifecycle services of a node, as a lifecycle manager is."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from lifecycle_msgs.msg import Transition, TransitionEvent

@@ -1,7 +1,5 @@
 """What the node tests share: a small swarm that stands and sees two landmarks, and ROS around it."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os

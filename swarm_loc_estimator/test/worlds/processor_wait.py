@@ -1,7 +1,5 @@
 """How long others kept a process or thread from running: not its fault on a busy machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 THIS_THREAD = "thread-self"

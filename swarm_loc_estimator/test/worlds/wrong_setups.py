@@ -1,7 +1,5 @@
 """Graphs that were good until one thing was changed, and what the doctor is to say of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import lru_cache

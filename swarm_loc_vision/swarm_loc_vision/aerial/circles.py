@@ -43,15 +43,10 @@ def strongest(
     least: Callable[[FloatArray], FloatArray],
     soft: NDArray[np.bool_],
 ) -> EdgesOnRays:
-    """The strongest edges of values (C, R, S), logarithms of brightness, along rays.
+    """The strongest edges of values (C, R, S), logarithms of brightness, at `SHARES` of reaches (C, R) [px].
 
-    Args:
-        values: At `SHARES` of `reach`.
-        is_rim: (C, R, S) whether brightness changes across the outline there, and not along it.
-        reach: (C, R) [px].
-        polarity: Polarity of the discs.
-        least: Least steps of edges by the logarithm of brightness on their darker side.
-        soft: (C,) whether the edges are taken for blurred ones.
+    At a rim (C, R, S) brightness changes across the outline and not along it; `least` are the least steps of
+    edges by their darker side, and edges of soft discs (C,) are taken for blurred ones.
     """
     sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
     inner = (sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE]) / _SIDE
@@ -63,7 +58,15 @@ def strongest(
     pitch = SHARES[1] - SHARES[0]
     share = SHARES[0] + pitch * (between + _vertex(steps, between) + _SIDE - 0.5)
     if soft.any():
-        share[soft] = _halfway(np.exp(values[soft]), best[soft] + _SIDE, polarity)
+        # motion makes an edge a ramp, whose middle is the rim; the logarithm is steepest at its dark end
+        ramp = np.arange(-_RAMP, _RAMP + 1)
+        window = np.clip(best[soft][..., None] + _SIDE + ramp, 0, values.shape[2] - 1)
+        counts = polarity * np.take_along_axis(np.exp(values[soft]), window, axis=2)
+        above = counts - 0.5 * (counts[..., :1] + counts[..., -1:])
+        last = np.clip(np.argmax(above < 0.0, axis=2), 1, 2 * _RAMP)[..., None]
+        before, after = (np.take_along_axis(above, last - k, axis=2)[..., 0] for k in (1, 0))
+        part = np.clip(before / np.maximum(before - after, 1e-9), 0.0, 1.0)
+        share[soft] = SHARES[0] + pitch * (np.take_along_axis(window, last - 1, axis=2)[..., 0] + part)
     step = np.take_along_axis(steps, best[..., None], axis=2)[..., 0]
     darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
     inside = (best > 0) & (best < steps.shape[2] - 1)
@@ -101,21 +104,6 @@ def _vertex(steps: FloatArray, between: NDArray[np.int64]) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = np.where(bend < 0.0, 0.5 * (left - right) / bend, 0.0)
     return np.asarray(np.clip(offset, -1.0, 1.0))
-
-
-def _halfway(values: FloatArray, near: NDArray[np.int64], polarity: float) -> FloatArray:
-    """Where counts (C, R, S) along rays are halfway between those on both sides of blurred edges, in `reach`.
-
-    Motion makes an edge a ramp, the middle of which is the rim; the logarithm is steepest at its dark end.
-    """
-    window = np.clip(near[..., None] + np.arange(-_RAMP, _RAMP + 1), 0, values.shape[2] - 1)
-    counts = polarity * np.take_along_axis(values, window, axis=2)
-    above = counts - 0.5 * (counts[..., :1] + counts[..., -1:])
-    last = np.clip(np.argmax(above < 0.0, axis=2), 1, 2 * _RAMP)[..., None]
-    before, after = (np.take_along_axis(above, last - k, axis=2)[..., 0] for k in (1, 0))
-    part = np.clip(before / np.maximum(before - after, 1e-9), 0.0, 1.0)
-    index = np.take_along_axis(window, last - 1, axis=2)[..., 0] + part
-    return np.asarray(SHARES[0] + (SHARES[1] - SHARES[0]) * index)
 
 
 _RADII = np.array([0.82, 0.91, 1.0, 1.09, 1.18])
@@ -373,10 +361,9 @@ def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: Float
 def _fit(
     away: FloatArray, is_edge: NDArray[np.bool_], radius: FloatArray, normal: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Fit outlines to edges, from their distances (C, R) along the rays and the normals (C, R, 2) there.
+    """Shift of centres, radius, second harmonic, covariance of the centre, spread, and the edges used.
 
-    Returns shift of the centre (C, 2), radius, second harmonic (C, 2), covariance of the centre, spread, and
-    the edges used.
+    Outlines are fitted to distances (C, R) of edges along the rays, with normals (C, R, 2) there.
     """
     # along a ray an outline moves by its motion along the normal over the cosine to it
     slope = 1.0 / np.einsum("cri,ri->cr", normal, DIRECTIONS)[..., None]

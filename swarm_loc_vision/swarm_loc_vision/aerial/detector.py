@@ -6,6 +6,7 @@ rclpy or of rosbags, whose fields have the same names.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -197,7 +198,13 @@ class AerialDetector:
         alike = np.abs(circles.radius / size - 1.0) <= _SAME_SIZE
         dropped = {"other_size": int(np.sum(~alike))}
         circles = circles.select(alike)
-        whole = _whole(circles)
+        # a touching disc may hide a rim, hardly anything else: a disc alone must show as much as the others,
+        # and not only where a square would
+        away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
+        np.fill_diagonal(away, np.inf)
+        alone = away.min(axis=1, initial=np.inf) > _TOUCHING * 2.0 * circles.radius
+        usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
+        whole = (circles.coverage >= _USUAL * usual) & (circles.squareness <= _MAX_SQUARENESS) | ~alone
         dropped["not_whole"] = int(np.sum(~whole))
         circles = circles.select(whole)
         most = self._settings.max_robots
@@ -261,7 +268,8 @@ class AerialDetector:
         least, largest = settings.min_diameter_px / per_metre, _MAX_SHARE * min(gray.shape) / per_metre
         diameters, scores = [np.zeros(0)], [np.zeros(0)]
         look, noise = None, noise_of(gray)
-        for diameter in ladder(1.2 * least, largest).tolist():
+        steps = math.log(largest / (1.2 * least)) / math.log(_RATIO)
+        for diameter in (1.2 * least * _RATIO ** np.arange(max(math.ceil(steps), 0) + 1)).tolist():
             # a pyramid: one image for all diameters that are neither small nor large in it
             if look is None or diameter > _ROUGH_PX[1] * look.grid.metres_per_px:
                 grid = rectification(ground, settings, diameter, (0.0, _ROUGH_PX[0]))
@@ -309,10 +317,10 @@ def _rank(circles: Circles) -> FloatArray:
 
 
 def _with_lids(rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: float, least: float) -> Circles:
-    """Circles with those that show an inner circle instead of their rim.
+    """Circles with those that show an inner circle instead of a rim, of which touching robots show little.
 
-    Where robots touch, little is left of their rims. What is on top of them, as a lid, has a rim of its own,
-    of the other polarity, which counts if most of the `clear` ones of radius `size` show it as well.
+    A lid on top has a rim of its own, of the other polarity, which counts if most of the `clear` ones of
+    radius `size` show it.
     """
     inner = Rims(rims.image, -rims.polarity, rims.min_contrast, rims.sides)
     sharp = np.zeros(len(circles.radius), np.bool_)
@@ -339,20 +347,6 @@ def _with_lids(rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: flo
     return circles.updated(np.flatnonzero(taken), lids)
 
 
-def _whole(circles: Circles) -> NDArray[np.bool_]:
-    """Which discs show enough of their rims.
-
-    A touching disc may hide a rim, hardly anything else; so a disc alone must show as much as the others, and
-    not only where a square would.
-    """
-    away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
-    np.fill_diagonal(away, np.inf)
-    alone = away.min(axis=1, initial=np.inf) > _TOUCHING * 2.0 * circles.radius
-    usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
-    is_round = (circles.coverage >= _USUAL * usual) & (circles.squareness <= _MAX_SQUARENESS)
-    return np.asarray(~alone | is_round)
-
-
 def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
     """Whether centres (C, 2) lie in the valid area."""
     rows, columns = grid.seen.shape
@@ -375,9 +369,7 @@ def _apart(circles: Circles) -> NDArray[np.int64]:
 def _refined(rims: Rims, circles: Circles, light: Light) -> Circles:
     """Circles with their centres by the steepest counts of their rims, where these agree with the logarithm.
 
-    What moves a centre from one kind of edge to the other is what blurs rims unevenly: marks, neighbours,
-    motion. A small part of it stays, so that it counts as an error. So does a part of the parallax of
-    robots whose outline is not that of top and sides: their sides may be there, but little darker.
+    A part of what uneven blur moves them is an error, as is a part of the parallax of sides left out.
     """
     sharp = np.zeros(len(circles.radius), np.bool_)
     fine = rims.measure(circles.centre, circles.radius, circles.kind, sharp, light, fine=True)
@@ -407,14 +399,7 @@ def _nothing(dropped: Mapping[str, int]) -> AerialDetections:
     return AerialDetections(pairs, none, np.zeros((0, 3, 3)), pairs, none, none, dropped)
 
 
-_RATIO = 1.3
-_ALIKE = 1.1
-
-
-def ladder(low: float, high: float) -> FloatArray:
-    """A geometric series of diameters from low to high."""
-    count = max(int(np.ceil(np.log(high / low) / np.log(_RATIO))), 0) + 1
-    return np.asarray(low * _RATIO ** np.arange(count))
+_RATIO, _ALIKE = 1.3, 1.1  # Of a diameter that is tried to the one before, and of those of one size
 
 
 def commonest(diameters: FloatArray, scores: FloatArray) -> float:
@@ -424,9 +409,6 @@ def commonest(diameters: FloatArray, scores: FloatArray) -> float:
     alike = np.abs(np.log(diameters[:, None] / diameters)) < np.log(_ALIKE)
     best = int(np.argmax(alike @ scores))
     return float(np.median(diameters[alike[best]]))
-
-
-MAP = "map"
 
 
 class AerialCamera(CalibratedCamera):
@@ -467,14 +449,7 @@ class AerialCamera(CalibratedCamera):
 
     def found(self, message: Any) -> bytes:
         """The serialized swarm_loc_msgs/AnonymousDetectionArray of an image, in map."""
-        detections = self._seen(self.gray(message))
-        self.drops.update(detections.dropped)
-        self.used += 1
-        self.robots += len(detections)
-        self.headings += int(np.isfinite(detections.theta).sum())
-        return encode_detections(MAP, nanoseconds(message.header.stamp), anonymous_rows(detections))
-
-    def _seen(self, gray: Gray) -> AerialDetections:
+        gray = self.gray(message)
         ground = self.control.look(gray) if self.control else None
         if ground is None:
             raise ImageError("no_control_points", self.why_nothing)
@@ -488,14 +463,13 @@ class AerialCamera(CalibratedCamera):
             self._seeing_trouble = str(error)
             raise ImageError("not_visible", str(error)) from error
         self._seeing_trouble = ""
-        return detections
-
-
-def anonymous_rows(detections: AerialDetections) -> NDArray[np.void]:
-    """Rows of `ANONYMOUS_DTYPE`."""
-    rows = np.zeros(len(detections), ANONYMOUS_DTYPE)
-    rows["x"], rows["y"] = detections.place.T
-    rows["theta"] = detections.theta
-    rows["covariance"] = detections.covariance
-    rows["u_px"], rows["v_px"] = detections.pixel.T
-    return rows
+        # count and encode
+        self.drops.update(detections.dropped)
+        self.used += 1
+        self.robots += len(detections)
+        self.headings += int(np.isfinite(detections.theta).sum())
+        rows = np.zeros(len(detections), ANONYMOUS_DTYPE)
+        rows["x"], rows["y"] = detections.place.T
+        rows["theta"], rows["covariance"] = detections.theta, detections.covariance
+        rows["u_px"], rows["v_px"] = detections.pixel.T
+        return encode_detections("map", nanoseconds(message.header.stamp), rows)

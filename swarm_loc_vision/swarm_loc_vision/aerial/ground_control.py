@@ -73,11 +73,6 @@ class AerialSettings:
     )
     max_robots: int = number(200, "1", 1, 2000, "most detections in one image; the clearest are kept")
 
-    @property
-    def region(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds (2,) of the searched region [m]."""
-        return np.array([self.x_min, self.y_min]), np.array([self.x_max, self.y_max])
-
 
 @dataclass(frozen=True)
 class AerialParameters:
@@ -227,11 +222,8 @@ class ControlPoints:
 
     def concatenate(self, other: ControlPoints) -> ControlPoints:
         """These points and others."""
-        return ControlPoints(
-            [*self.names, *other.names],
-            np.concatenate([self.places, other.places]),
-            np.concatenate([self.pixels, other.pixels]),
-        )
+        places, pixels = (self.places, other.places), (self.pixels, other.pixels)
+        return ControlPoints([*self.names, *other.names], np.concatenate(places), np.concatenate(pixels))
 
 
 NO_POINTS = ControlPoints((), np.zeros((0, 3)), np.zeros((0, 2)))
@@ -299,7 +291,7 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
     guess = _guess(camera, points)
     depth = (points.places @ rotation_of(guess).T + guess[3:])[:, 2]
     of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
-    sigma = np.asarray(np.hypot(settings.control_sigma_px, of_place))  # (N,) of the points [px]
+    sigma: FloatArray = np.hypot(settings.control_sigma_px, of_place)  # (N,) of the points [px]
 
     def deviations(pose: FloatArray) -> FloatArray:
         away = (projected(camera, pose, points.places) - points.pixels) / sigma[:, None]
@@ -320,7 +312,7 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
         raise ControlPointError("the control points leave the camera's pose open.")
     freedom = away.size - POSE_SIZE
     growth = max(1.0, float(np.sum(away**2)) / freedom) if freedom > 0 else 1.0
-    covariance = np.asarray(growth * np.linalg.inv(even) / np.outer(scale, scale))
+    covariance: FloatArray = growth * np.linalg.inv(even) / np.outer(scale, scale)
     ground = GroundCamera(camera, pose, covariance)
     if ground.centre[2] <= points.places[:, 2].max():
         raise ControlPointError(
@@ -368,11 +360,8 @@ def misfit(fit: PoseFit, points: ControlPoints, settings: AerialSettings) -> str
     if fit.deviations[worst] <= settings.max_residual:
         return ""
     for suspect in np.argsort(-fit.deviations).tolist():
-        rest = ControlPoints(
-            [name for k, name in enumerate(points.names) if k != suspect],
-            np.delete(points.places, suspect, axis=0),
-            np.delete(points.pixels, suspect, axis=0),
-        )
+        columns = (np.delete(one, suspect, axis=0) for one in (points.places, points.pixels))
+        rest = ControlPoints([n for k, n in enumerate(points.names) if k != suspect], *columns)
         try:
             without = solve_pose(fit.ground.camera, rest, settings)
         except ControlPointError:

@@ -52,11 +52,7 @@ class LocateError(UserError):
 def fixed_camera(name: str, ground: GroundCamera, height: float = 0.0) -> FixedCamera:
     """The description of a camera over the floor, named like the namespace of its topics.
 
-    Its sigmas are the largest in its image, by the covariance of the pose, for markers on robots at a height
-    above the floor [m].
-
-    Raises:
-        LocateError: The camera does not see markers that lie at this height.
+    Its sigmas are those of `floor_sigmas`, for markers on robots at a height above the floor [m].
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle

@@ -61,7 +61,7 @@ def rectification(
     """
     height, least_px = settings.robot_height, settings.min_diameter_px
     flat, scale = _visible(ground, height)
-    lower, upper = settings.region
+    lower, upper = (settings.x_min, settings.y_min), (settings.x_max, settings.y_max)
     usable = scale * diameter >= least_px
     if not len(flat):
         raise RectificationError(f"the camera does not see the plane {height:g} m above the floor.")

@@ -1,1 +1,1 @@
-"""Images, cameras, sampling and what all camera nodes share."""
+"""Images, cameras and what all camera nodes share."""

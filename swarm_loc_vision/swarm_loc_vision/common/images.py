@@ -116,10 +116,6 @@ class _Compression:
     end: bytes  # Mark after all pixel data
     size: Callable[[bytes], Size | None]  # Width and height in its header
 
-    def is_whole(self, data: bytes) -> bool:
-        """Whether bytes are a whole image; cameras may append bytes."""
-        return data.startswith(self.begin) and data.rfind(self.end) > data.rfind(self.data) > 0
-
 
 _JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9", _jpeg_size)
 _PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND", _png_size)
@@ -164,8 +160,7 @@ def decoded_image(message: Any, size: Size) -> Gray:
     not decoded: a small one may say that it has a billion pixels.
 
     Raises:
-        ImageError: The format is unknown (`encoding`), the bytes are no whole image of it (`corrupt`), or it
-            has another size (`size`).
+        ImageError: Unknown format (`encoding`), no whole image (`corrupt`), or another size (`size`).
     """
     how = message.format
     raw = np.frombuffer(message.data, np.uint8)
@@ -180,7 +175,8 @@ def decoded_image(message: Any, size: Size) -> Gray:
             "encoding", f"the image's format is '{how}', but must be one of {names}, or empty for these."
         )
     gray: NDArray[Any] | None = None
-    if known.is_whole(data) and (found := known.size(data)):
+    is_whole = data.startswith(known.begin) and data.rfind(known.end) > data.rfind(known.data) > 0
+    if is_whole and (found := known.size(data)):  # cameras may append bytes
         _check_size(found, size)
         how_read = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         with suppress(cv2.error):  # it would be too large

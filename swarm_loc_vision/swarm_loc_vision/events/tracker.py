@@ -37,11 +37,6 @@ class LightSource:
     # of the robot's own laser
     is_above: bool
 
-    @property
-    def period_ns(self) -> int:
-        """[ns]."""
-        return round(1e9 / self.frequency)
-
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -188,12 +183,13 @@ class LightTracker:
         self._settings, (self._width, self._height) = settings, size
         self._window_ns = round(1e9 * settings.window)
         self._begin_ns: int | None = None
-        self._period_ns = np.array([source.period_ns for source in sources], np.int64)
+        self._period_ns = np.array([round(1e9 / source.frequency) for source in sources], np.int64)
         self._is_above = np.array([source.is_above for source in sources], bool)
         self._switches = [max(1.0, 2.0 * settings.window * source.frequency) for source in sources]
         self._density = np.zeros((len(sources), self._height + 2, self._width + 2), np.int32)
         pixels = 2 * self._width * self._height
-        self._bursts = _Bursts(*np.empty((2, pixels), np.int64), np.empty(pixels, np.int32))
+        event_ns, begin_ns = np.empty((2, pixels), np.int64)
+        self._bursts = _Bursts(event_ns, begin_ns, np.empty(pixels, np.int32))
         self._hits: list[_Hits] = []
         self._reset()
 
@@ -237,32 +233,25 @@ class LightTracker:
         self._hits.append(_Hits._make(column[:found] for column in hits))
 
     def _report(self) -> list[Sighting]:
-        """The lights of the open window, which is cleared.
-
-        Where bursts of a strong light are lost it also shows up at multiples of its period; such echoes are
-        left out.
-        """
+        """The lights of the open window, which is cleared."""
         hits = _Hits._make(np.concatenate(column) for column in zip(*self._hits, strict=True))
         self._hits.clear()
         moments, radius = np.zeros((len(self._density), _MOMENTS)), self._settings.radius
         _locate(hits, self._density, radius, self._settings.min_events, moments)
         found = [self._sighting(source, row) for source, row in enumerate(moments) if row[_COUNT]]
-        return [
-            one
-            for one in found
-            if not any(
-                other.events > 2 * one.events and np.hypot(one.u - other.u, one.v - other.v) < radius
-                for other in found
-            )
-        ]
+
+        def is_echo_of(one: Sighting, other: Sighting) -> bool:
+            """Where bursts of a strong light are lost it also shows up at multiples of its period."""
+            is_near = np.hypot(one.u - other.u, one.v - other.v) < radius
+            return bool(is_near and other.events > 2 * one.events)
+
+        return [one for one in found if not any(is_echo_of(one, other) for other in found)]
 
     def _sighting(self, source: int, row: FloatArray) -> Sighting:
-        """The light of a row of moments.
-
-        Noise averages out over bursts. The error within a pixel averages out only over the events of one
-        switch, because the same pixels answer every switch.
-        """
+        """The light of a row of moments."""
         scatter = np.array([[row[_UU], row[_UV]], [row[_UV], row[_VV]]]) / row[_COUNT]
+        # noise averages out over bursts, the error within a pixel only over the events of one switch, because
+        # the same pixels answer every switch
         at_a_switch = max(1.0, row[_COUNT] / self._switches[source])
         locking = float(_PIXEL_VARIANCE / at_a_switch)
         systematic = locking + self._settings.sigma_floor**2

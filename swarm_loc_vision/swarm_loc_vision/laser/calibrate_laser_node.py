@@ -11,7 +11,6 @@ start. The node subscribes to `odom` and `laser` and publishes `cmd_vel`. Parame
 from __future__ import annotations
 
 import math
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +31,6 @@ from swarm_loc_estimator.common.parameters import ParameterError, number, text
 from swarm_loc_msgs.msg import LaserDistance
 from swarm_loc_vision.laser.calibration import (
     CalibrationError,
-    LaserCalibration,
     WallDrive,
     fit_hyperbola,
     recorded_drive,
@@ -119,7 +117,14 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         params = self.params
         calibration = fit_hyperbola(drive.drive(params.start_sigma, params.camera_x))
         save_laser(Path(params.output), calibration)
-        print(summary(calibration, drive.count, params.output), file=sys.stdout)
+        near, far = calibration.min_depth, calibration.max_depth
+        _, sigma = calibration.distance(calibration.row(1.0), 0.0)
+        print(
+            f"{drive.count} rows between {near:.2f} and {far:.2f} m:"
+            f" p_inf = {calibration.row_at_infinity:.2f} px, f b = {calibration.focal_base:.3f} px m,"
+            f" sigma_px = {calibration.row_sigma:.3f}; a distance of 1 m is known to {100.0 * sigma:.1f} cm."
+        )
+        print(f"wrote {params.output}")
         return 0
 
     def _send_speed(self) -> None:
@@ -139,18 +144,6 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
     def _on_laser(self, message: LaserDistance) -> None:
         self._heard_s["laser"] = time.monotonic()
         self._drive.take_row(nanoseconds(message.header.stamp), message.v_px)
-
-
-def summary(calibration: LaserCalibration, count: int, path: str) -> str:
-    """The result as text."""
-    near, far = calibration.min_depth, calibration.max_depth
-    _, sigma = calibration.distance(calibration.row(1.0), 0.0)
-    return (
-        f"{count} rows between {near:.2f} and {far:.2f} m:"
-        f" p_inf = {calibration.row_at_infinity:.2f} px, f b = {calibration.focal_base:.3f} px m,"
-        f" sigma_px = {calibration.row_sigma:.3f}; a distance of 1 m is known to {100.0 * sigma:.1f} cm.\n"
-        f"wrote {path}"
-    )
 
 
 main = partial(run_node, "calibrate_laser", CalibrateLaserNode)

@@ -235,7 +235,8 @@ def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBi
     # knots from the edge up to where samples are too few
     counts = np.bincount(((rows - edge) / STEP_PX).astype(np.int64))
     sparse = np.flatnonzero(counts < _LEAST_SAMPLES)
-    knots = edge + STEP_PX * np.arange((int(sparse[0]) if len(sparse) else len(counts)) + 1)
+    cells = int(sparse[0]) if len(sparse) else len(counts)
+    knots = np.asarray(edge + STEP_PX * np.arange(cells + 1), np.float64)
     if len(knots) < 2:
         return RowBias()
     # a fit to each half must serve the other half
@@ -343,15 +344,10 @@ class LaserCalibration:
         return self.row_at_infinity + self.focal_base / depth
 
     def distance(self, row: float, row_variance: float, locking: float = 0.0) -> Distance:
-        """Distance from base_link to what the laser hits.
+        """Distance from base_link to what the laser hits, by the row of its spot; NaN outside the depths.
 
-        Args:
-            row: Of the spot as it was tracked [px].
-            row_variance: Its variance by the tracker [px^2]; at least that of the calibration is used.
-            locking: Its part that is the bias within pixels [px^2]; left out where `row_bias` is known.
-
-        Returns:
-            NaN outside the calibrated depths.
+        The variance of the row is that by the tracker, at least that of the calibration [px^2]; its part
+        `locking`, the bias within pixels, is left out where `row_bias` is known.
         """
         offset = row - self.row_bias.at(row) - self.row_at_infinity
         if not self.focal_base / self.max_depth <= offset <= self.focal_base / self.min_depth:

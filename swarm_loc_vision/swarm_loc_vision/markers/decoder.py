@@ -70,25 +70,11 @@ class _Rules(NamedTuple):
 
 
 class Dictionary:
-    """Words in use of families with the same layout.
-
-    Args:
-        layout: The layout.
-        ids_of: Ids in use of each family.
-
-    Attributes:
-        layout: The layout.
-        codes: (N,) the family's code of each word.
-        ids: (N,) its id in it.
-        strips: (N, 4, cells) the row of cells behind the border along each side, clockwise, as the detector
-            sees them; 1 is white.
-        correctable: Bits that may differ; see `FALSE_READINGS`.
-        scarce: Whether even words without a difference are too common, see the module.
-        framed: Whether the margin must be seen: words are scarce, or the margin is a part of the marker.
-    """
+    """Words in use of families with the same layout; `ids_of` are the ids in use of each family."""
 
     def __init__(self, layout: Layout, ids_of: Mapping[Family, NDArray[np.int64]]) -> None:
         self.layout = layout
+        # (N,) the family's code of each word, and its id in it
         self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in ids_of.items()])
         self.ids = np.concatenate(list(ids_of.values()))
         words = np.concatenate([family.words[ids] for family, ids in ids_of.items()])
@@ -96,20 +82,17 @@ class Dictionary:
             words = words ^ np.uint64((1 << layout.bits) - 1)  # as seen with light and dark swapped
         self._words = np.concatenate([layout.rotated(words, quarters) for quarters in range(4)])
         self._places = _Places(layout.data, layout.ring, layout.margin)
-        self.correctable = correctable_bits(len(words), layout.bits)
+        self.correctable = correctable_bits(len(words), layout.bits)  # Bits that may differ
+        # whether even words without a difference are too common, and whether the margin must be seen
         self.scarce = 4.0 * len(words) / 2.0**layout.bits > FALSE_READINGS
         self.framed = self.scarce or layout.surrounded
+        # (N, 4, cells) the row of cells behind the border along each side, clockwise, as seen; 1 is white
         cells = layout.inner(words)
         rows = np.stack([np.rot90(cells, k, axes=(1, 2))[:, 0] for k in range(4)], axis=1)
         self.strips = np.pad(rows, ((0, 0), (0, 0), (layout.border, layout.border)))
 
     def read(self, cells: FloatArray, min_contrast: float) -> Readings:
-        """Decode candidates.
-
-        Args:
-            cells: (N, grid, grid) of `sampling.read_cells`, see `Layout.grid`.
-            min_contrast: Minimum difference of light and dark cells [counts].
-        """
+        """Decode cells (N, grid, grid) of `read_cells`; light and dark differ by `min_contrast` [counts]."""
         count = len(cells)
         readings = Readings(
             np.full(count, -1), np.zeros(count, np.int64), np.zeros(count), np.zeros(count), np.zeros(count)
@@ -169,8 +152,7 @@ def _read(cells: FloatArray, words: Words, places: _Places, rules: _Rules, readi
 def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: FloatArray) -> float:
     """Write sharpened brightness minus dark (area, area); returns that of light, 0 if there is none.
 
-    Dark is a plane through the border's inner ring, to allow for uneven light, written to `plane` (3,): in
-    the middle, by column, by row. Light is the mean of the lighter data cells.
+    Dark is a plane through the border's inner ring, written to `plane`: in the middle, by column, by row.
     """
     area = len(sharp)
     # sharpen: subtract light of the four neighbours
@@ -217,10 +199,7 @@ def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: Float
 
 @cached_njit
 def _clear_cells(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> float:
-    """Map data to -1 (dark) ... 1 (light) in `clear`; returns the light of the border's inner ring in cells.
-
-    The share `level` of `light` maps to 0.
-    """
+    """Map data to -1 (dark) ... 1 (light), `level` of light to 0; returns the border's light in cells."""
     for bit in range(len(places.data)):
         clear[bit] = _clearness(flat[places.data[bit, 0], places.data[bit, 1]], light, level)
     border = 0.0
@@ -252,17 +231,11 @@ def _has_margin(cells: FloatArray, light: float, level: float, places: _Places, 
 def nearest(
     words: Words, seen: np.uint64, clear: FloatArray, bits: NDArray[np.uint8]
 ) -> tuple[int, float, float]:
-    """Find the nearest word to a candidate.
+    """Index of the word (N,) that is nearest to a candidate's bits, its weighted distance, and the second's.
 
-    Args:
-        words: (N,) all words.
-        seen: The candidate's bits.
-        clear: (bits,) soft bits, -1 (dark) to 1 (light).
-        bits: (N,) filled with the number of different bits.
-
-    Returns:
-        Index of the nearest word, its weighted distance, and that of the second nearest. A distant second is
-        that with the fewest different bits, although another may be nearer by a tenth of a weighted bit.
+    Clear (bits,) are soft bits, -1 (dark) to 1 (light); `bits` (N,) is filled with the number of different
+    bits. A distant second is that with the fewest of them, although another may be nearer by a tenth of a
+    weighted bit.
     """
     count = clear.size
     fewest, second = np.uint8(count), np.uint8(count)

@@ -48,22 +48,16 @@ _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
 class ImageBag:
-    """A bag with images, to be read once.
+    """A bag with images, to be read once: a rosbag2 folder, .mcap or .db3 file; may be truncated.
 
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file; may be truncated.
-        create: Creates the detector of a camera from its namespace and transport.
-
-    Attributes:
-        cameras: The detectors by namespace.
-        losses: Unreadable parts of the bag, one sentence each.
+    `create` creates the detector of a camera from its namespace and transport.
 
     Raises:
         BagError: The bag cannot be read, or has no images.
     """
 
     def __init__(self, bag: Path, create: CreateCamera) -> None:
-        self.losses: Sequence[str] = ()
+        self.losses: Sequence[str] = ()  # Unreadable parts of the bag, one sentence each
         self._bag = bag
         with BagReader(bag) as reader:
             topics = reader.topics
@@ -77,21 +71,15 @@ class ImageBag:
         if not self._images:
             names = " nor ".join(f"image_raw{transport.suffix}" for transport in TRANSPORTS.values())
             raise BagError(f"'{bag}' holds no images: there is neither {names}.")
-        self.cameras: Mapping[str, CameraDetector] = {
+        self.cameras: Mapping[str, CameraDetector] = {  # By namespace
             space.rstrip("/"): create(space.rstrip("/"), transport)
             for space, (_, transport) in sorted(self._images.items())
         }
 
     def detect(self, folder: Path, progress: Progress, swarm: Path | None) -> int:
-        """Write a bag with detections in place of images.
+        """Write a new bag with detections in place of images; returns the number of messages.
 
-        Args:
-            folder: The new bag; must not exist.
-            progress: Called with the share done and a word for the activity.
-            swarm: The description to copy to it, None for none.
-
-        Returns:
-            Number of messages.
+        `progress` is called with the share done and a word for the activity; `swarm` is copied to the bag.
 
         Raises:
             BagError: The bag cannot be read, or the new one cannot be created.

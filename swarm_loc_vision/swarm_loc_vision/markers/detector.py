@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
@@ -25,14 +24,13 @@ from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, number, text, texts
-from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import LENS_KIND, LENS_SIZE, STRAIGHT, Camera
 from swarm_loc_vision.common.images import TRANSPORTS, CalibratedCamera, Gray, GrayOf
-from swarm_loc_vision.common.sampling import homographies, read_cells
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.edges import NEW_CAMERA, refine, refine_read
 from swarm_loc_vision.markers.families import Family, Layout, draw_marker, families, family_named
+from swarm_loc_vision.markers.lines import homographies, read_cells, refine
 from swarm_loc_vision.markers.pose import (
     SHIFT,
     Body,
@@ -43,7 +41,8 @@ from swarm_loc_vision.markers.pose import (
     robot_body,
     up_of,
 )
-from swarm_loc_vision.markers.quads import find_quads
+from swarm_loc_vision.markers.quads import apart, find_quads
+from swarm_loc_vision.markers.sides import NEW_CAMERA, refine_read
 
 
 @dataclass(frozen=True)
@@ -99,14 +98,8 @@ class _Markers(NamedTuple):
 class MarkerDetector:
     """Finds the markers in use.
 
-    Args:
-        settings: Settings of the detector.
-        families: Ids in use of each family in use; None: all of its ids.
-        camera: The camera; None: no poses, no distortion.
-        lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
-        up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
-        lying: Ids of markers that lie flat, to which `settings.tilt_sigma` does not apply.
-        bodies: Bodies that carry several markers.
+    `families` are the ids in use of each family, None for all of its ids. Without a camera there are no poses
+    and no distortion. For the other arguments see `PoseSolver`.
     """
 
     def __init__(
@@ -146,9 +139,17 @@ class MarkerDetector:
                 if dictionary.layout.surrounded == swapped
                 for block in blocks
             ]
-        markers = _best(_Markers(*map(np.concatenate, zip(*found, strict=True))))
+        # of duplicates the reading with the fewest errors, then the highest contrast
+        markers = _Markers(*map(np.concatenate, zip(*found, strict=True)))
+        middle, order = markers.corners.mean(axis=1), np.lexsort((-markers.contrast, markers.errors))
+        markers = markers.select(apart(middle, _SAME * _diagonals(markers.corners), order))
         corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
-        return Detections(*markers[:5], corners, *self._poses(markers), dropped)
+        # poses of all markers, jointly for bodies
+        poses, misfits = None, 0
+        if self._solver is not None:
+            covariance = markers.covariance + (0.0 if self._lens[LENS_KIND] == STRAIGHT else SHIFT)
+            poses, misfits = self._solver.solve(markers.id, markers.corners, covariance)
+        return Detections(*markers[:5], corners, poses, misfits, dropped)
 
     def _candidates(self, gray: Gray, dropped: Counter[str]) -> FloatArray:
         """(N, 4, 2) dark quadrangles [ideal px]."""
@@ -195,24 +196,6 @@ class MarkerDetector:
         )
         return markers.select(fine.contrast > 0.0)
 
-    def _poses(self, markers: _Markers) -> tuple[Poses | None, int]:
-        """Poses of all markers, jointly for bodies, and the number of misfits."""
-        if self._solver is None:
-            return None, 0
-        shift = 0.0 if self._lens[LENS_KIND] == STRAIGHT else SHIFT
-        return self._solver.solve(markers.id, markers.corners, markers.covariance + shift)
-
-
-def _best(markers: _Markers) -> _Markers:
-    """Remove duplicates: keeps the reading with the fewest errors, then the highest contrast."""
-    if not len(markers.id):
-        return markers
-    middle, kept = markers.corners.mean(axis=1), np.zeros(len(markers.id), np.bool_)
-    near = KDTree(middle).query_ball_point(middle, _SAME * _diagonals(markers.corners))
-    for i in np.lexsort((-markers.contrast, markers.errors)):
-        kept[i] = not kept[near[i]].any()
-    return markers.select(kept)
-
 
 def _diagonals(quads: FloatArray) -> FloatArray:
     """(N,) lengths of a diagonal of quadrangles (N, 4, 2) [px]."""
@@ -237,21 +220,15 @@ CreateDetector = Callable[[Camera], MarkerDetector]
 
 
 class CameraDetector(CalibratedCamera):
-    """The detector of one camera; created when its calibration arrives.
+    """The detector of one camera, which `create` creates when its calibration arrives.
 
-    Args:
-        create: Creates the detector for a camera.
-        gray_of: Reads an image message, see `TRANSPORTS`.
-        ambiguity: See `detection_rows`.
-
-    Attributes:
-        markers: Number of markers with a pose; `drops` also counts those without, and candidates.
-        misfits: Number of them whose corners do not fit a square.
+    `gray_of` reads an image message, see `TRANSPORTS`; for `ambiguity` see `detection_rows`.
     """
 
     def __init__(self, create: CreateDetector, gray_of: GrayOf, ambiguity: float) -> None:
         super().__init__(gray_of)
-        self.markers = self.misfits = 0
+        self.markers = 0  # Number of markers with a pose; `drops` also counts those without, and candidates
+        self.misfits = 0  # Number of them whose corners do not fit a square
         self._create = create
         self._ambiguity = ambiguity
         self._detector: MarkerDetector  # set with the calibration, without which images are dropped
@@ -278,9 +255,7 @@ _MIN_CHI2 = 1e-6
 def detection_rows(detections: Detections, ambiguity: float) -> NDArray[np.void]:
     """Rows of `DETECTION_DTYPE`, one per marker that has a pose.
 
-    Args:
-        detections: Detections with poses.
-        ambiguity: The mirrored pose is included if its chi square is higher by at most this.
+    The mirrored pose is included if its chi square is higher by at most `ambiguity`.
 
     Raises:
         ValueError: The detector has no camera.
@@ -308,11 +283,9 @@ def detection_rows(detections: Detections, ambiguity: float) -> NDArray[np.void]
     return rows
 
 
-def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quaternions(rotations: FloatArray) -> FloatArray:
     """(N, 4) x, y, z, w."""
-    if not len(rotations):
-        return np.zeros((0, 4))
-    return np.asarray(Rotation.from_matrix(rotations).as_quat())
+    return np.asarray(Rotation.from_matrix(rotations).as_quat()) if len(rotations) else np.zeros((0, 4))
 
 
 _IDS = re.compile(r"(\d+)(?:-(\d+))?")
@@ -368,12 +341,35 @@ def known_markers(parameters: MarkersInUse) -> KnownMarkers:
     """
     family = family_named(parameters.family)
     swarm = load_swarm(Path(parameters.swarm_file)) if parameters.swarm_file else Swarm()
-    carrier = _carrier(parameters, swarm)
+    # the robot that carries the camera, or the fixed camera itself
+    name, file, carriers = parameters.robot, parameters.swarm_file, {one.name: one for one in swarm.sources}
+    if name and not file:
+        raise ParameterError(f"parameter robot = '{name}' needs the parameter swarm_file, too.")
+    if name and name not in carriers:
+        raise ParameterError(
+            f"parameter robot = '{name}' must be a robot or fixed camera of the swarm: {', '.join(carriers)}."
+        )
+    carrier = carriers.get(name)
     mount = carrier.camera if isinstance(carrier, Robot) else carrier
+    # the ids in use
+    count, owners = len(family.words), swarm.owner_of
+    ids = np.array(sorted(owners), np.int64) if owners else None
+    if parameters.ids:
+        ids = parse_ids("ids", parameters.ids, count)
+    elif unknown := [marker_id for marker_id in owners if marker_id >= count]:
+        raise ParameterError(
+            f"{file} has marker id {unknown[0]}, but {family.name} has only 0 to {count - 1}."
+        )
+    # sides by id, from the swarm or from the parameter
+    if parameters.lengths and file:
+        raise ParameterError(
+            "parameter lengths cannot be given along with swarm_file, which has the size of each marker."
+        )
+    lengths = {marker_id: owner.marker.size for marker_id, owner in owners.items()}
     return KnownMarkers(
         family,
-        _ids(parameters, swarm, family),
-        _lengths(parameters, swarm, family),
+        ids,
+        lengths if file else parse_lengths(parameters.lengths, count),
         up_of(mount or CameraMount()),
         [face.id for other in swarm.robots for face in other.faces if face.lies],
         [robot_body(other) for other in swarm.robots if other is not carrier],
@@ -381,12 +377,7 @@ def known_markers(parameters: MarkersInUse) -> KnownMarkers:
 
 
 def detector_maker(parameters: DetectorParameters) -> CreateDetector:
-    """Creates the detector for a camera.
-
-    Raises:
-        ParameterError: A parameter cannot be used.
-        SwarmFileError: The swarm description cannot be used.
-    """
+    """Creates the detector for a camera; raises what `known_markers` does."""
     family, ids, lengths, up, lying, bodies = known_markers(parameters)
 
     def create(camera: Camera) -> MarkerDetector:
@@ -397,55 +388,8 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
     return create
 
 
-def _carrier(parameters: MarkersInUse, swarm: Swarm) -> Robot | FixedCamera | None:
-    """The robot that carries the camera, or the fixed camera itself."""
-    if not parameters.robot:
-        return None
-    if not parameters.swarm_file:
-        raise ParameterError(f"parameter robot = '{parameters.robot}' needs the parameter swarm_file, too.")
-    carriers = {one.name: one for one in swarm.sources}
-    if parameters.robot not in carriers:
-        raise ParameterError(
-            f"parameter robot = '{parameters.robot}' must be a robot or fixed camera of the swarm:"
-            f" {', '.join(carriers)}."
-        )
-    return carriers[parameters.robot]
-
-
-def _ids(parameters: MarkersInUse, swarm: Swarm, family: Family) -> IntArray | None:
-    """The ids in use; None: all."""
-    count = len(family.words)
-    if parameters.ids:
-        return parse_ids("ids", parameters.ids, count)
-    if not swarm.owner_of:
-        return None
-    unknown = [marker_id for marker_id in swarm.owner_of if marker_id >= count]
-    if unknown:
-        raise ParameterError(
-            f"{parameters.swarm_file} has marker id {unknown[0]},"
-            f" but {family.name} has only 0 to {count - 1}."
-        )
-    return np.array(sorted(swarm.owner_of), np.int64)
-
-
-def _lengths(parameters: MarkersInUse, swarm: Swarm, family: Family) -> dict[int, float]:
-    """Sides by id, from the swarm or from the parameter."""
-    if parameters.lengths and parameters.swarm_file:
-        raise ParameterError(
-            "parameter lengths cannot be given along with swarm_file, which has the size of each marker."
-        )
-    if parameters.swarm_file:
-        return {marker_id: owner.marker.size for marker_id, owner in swarm.owner_of.items()}
-    return parse_lengths(parameters.lengths, len(family.words))
-
-
 def parse_ids(name: str, selected: Sequence[str], count: int) -> NDArray[np.int64]:
-    """Ids (N,), ascending.
-
-    Args:
-        name: Parameter, for errors.
-        selected: Ids or ranges, such as 5 or 0-31.
-        count: Ids that there are.
+    """Ids (N,), ascending, of ids or ranges such as 0-31; there are `count`, and `name` is the parameter's.
 
     Raises:
         ParameterError: A text is not one, or an id does not exist.
@@ -465,11 +409,7 @@ def parse_ids(name: str, selected: Sequence[str], count: int) -> NDArray[np.int6
 
 
 def parse_lengths(selected: Sequence[str], count: int) -> dict[int, float]:
-    """Marker id -> side [m].
-
-    Args:
-        selected: Each an id or a range, a colon, and a length in metres.
-        count: Ids that there are.
+    """Marker id -> side [m], of texts with an id or a range, a colon, and a length in metres.
 
     Raises:
         ParameterError: A text is not one, an id does not exist, or a length is out of range.

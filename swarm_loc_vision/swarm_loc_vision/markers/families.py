@@ -226,13 +226,9 @@ WHITE = 255
 def draw_marker(
     family: Family, marker_id: int, pixels_per_cell: int = 8, margin: int = 1
 ) -> NDArray[np.uint8]:
-    """An image (n, n) of 0 and 255 of an upright marker, n = (cells of pattern + 2 margin) pixels_per_cell.
+    """An image (n, n) of 0 and 255 of an upright marker with a white margin [cells].
 
-    Args:
-        family: Family of the marker.
-        marker_id: Its id.
-        pixels_per_cell: Size of a cell [px].
-        margin: Width of the white margin [cells].
+    Its side n is (cells of pattern + 2 margin) pixels_per_cell.
 
     Raises:
         ValueError: The family has no such id.

@@ -119,21 +119,14 @@ class ForeignParameters(MarkersInUse):
 class ForeignMarkers(Calibration):
     """The markers that another detector finds in the images of one camera.
 
-    Args:
-        parameters: Which markers there are, and what the other detector does.
-
     Raises:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
-
-    Attributes:
-        markers: Number of markers with a pose.
-        misfits: Number of them whose corners do not fit a square.
     """
 
     def __init__(self, parameters: ForeignParameters) -> None:
         super().__init__()
-        self.markers = self.misfits = 0
+        self.markers = self.misfits = 0  # Number of markers with a pose, and of those that fit no square
         self._parameters = parameters
         self._kind = KINDS[parameters.source]
         if parameters.family not in self._kind.families:
@@ -165,7 +158,10 @@ class ForeignMarkers(Calibration):
 
     def found(self, message: Any) -> bytes:
         """The serialized swarm_loc_msgs/MarkerDetectionArray of the markers in an image."""
-        camera = self._camera_of(message)
+        camera, frame = self.known_camera(), message.header.frame_id
+        if frame != self._frame:
+            said = f"markers are in frame '{frame}', but camera_info in '{self._frame}': is output_frame set?"
+            raise ImageError("foreign_frame", said)
         detections = self._solved(camera, list(self._used(message, camera)))
         rows = detection_rows(detections, self._parameters.settings.ambiguity)
         self.drops["no_pose"] += len(detections) - len(rows)
@@ -173,24 +169,18 @@ class ForeignMarkers(Calibration):
         self.misfits += detections.misfits
         return encode_detections(message.header.frame_id, nanoseconds(message.header.stamp), rows)
 
-    def _camera_of(self, message: Any) -> Camera:
-        camera, frame = self.known_camera(), message.header.frame_id
-        if frame != self._frame:
-            said = f"markers are in frame '{frame}', but camera_info in '{self._frame}': is output_frame set?"
-            raise ImageError("foreign_frame", said)
-        return camera
-
     def _used(self, message: Any, camera: Camera) -> Iterator[ForeignMarker]:
         """The markers that can be used."""
         family, ids = self._known.family, self._known.ids
         for marker in self._kind.markers(message, camera, self._parameters):
+            x, y = marker.corners.T
             if marker.family not in ("", _APRILTAG_NAMES.get(family.name)):
                 self.drops["other_family"] += 1
             elif not 0 <= marker.id < len(family.words) or (ids is not None and marker.id not in ids):
                 self.drops["unknown_id"] += 1
             elif not np.isfinite(marker.corners).all():
                 self.drops["not_finite"] += 1
-            elif _signed_area(marker.corners) <= 0.0:
+            elif x @ (np.roll(y, -1) - np.roll(y, 1)) <= 0.0:  # counter-clockwise
                 self.drops["corner_order"] += 1
             else:
                 yield marker
@@ -203,9 +193,3 @@ class ForeignMarkers(Calibration):
         poses, misfits = self._solver.solve(ids, corners, covariance)
         codes, unknown = np.full(count, self._known.family.code), np.full(count, np.nan)
         return Detections(codes, ids, unknown, unknown, unknown, camera.to_raw(corners), poses, misfits, {})
-
-
-def _signed_area(corners: FloatArray) -> float:
-    """Area of a quadrangle (4, 2) [px^2], positive if its corners go clockwise in the image."""
-    x, y = corners.T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))

@@ -41,12 +41,7 @@ class MarkerNode(CameraNode[Markers]):
     """Publishes the markers of a camera."""
 
     def use_markers(self, camera: CameraDetector | ForeignMarkers, source: Input) -> None:
-        """Publish the markers in messages while the node is active, and compile what that needs.
-
-        Args:
-            camera: Finds them.
-            source: Its messages.
-        """
+        """Publish what a camera finds in messages while the node is active, and compile what that needs."""
         self._camera = camera
         self._reported = (0, 0)  # markers and misfits
         if not is_precompiled(precompile):

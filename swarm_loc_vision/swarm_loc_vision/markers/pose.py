@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import number
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot
+from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot
 from swarm_loc_vision.common.camera import Camera
 
 _ROUNDS = 12
@@ -88,17 +88,12 @@ def marker_poses(
     intrinsics: FloatArray,
     upright: Upright | None = None,
 ) -> tuple[Poses, NDArray[np.bool_]]:
-    """Solve for the poses of markers; also returns which markers misfit.
+    """Solve for the poses of markers with sides (N,) [m]; also returns which markers misfit.
 
-    There is one solution where both initial poses converge to the same. For a misfit, the variance of the
-    residuals of plain least squares is added to the covariance of the corners.
-
-    Args:
-        corners: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
-        covariance: (N, 8, 8) of the corners [px^2].
-        lengths: (N,) sides [m].
-        intrinsics: (4,) fx, fy, cx, cy [px].
-        upright: Given if the markers' y axes are known to point up.
+    Corners (N, 4, 2) go clockwise from the marker's own upper left [ideal px], with a covariance (N, 8, 8);
+    `upright` is given if the markers' y axes are known to point up. There is one solution where both initial
+    poses converge to the same. For a misfit, the variance of the residuals of plain least squares is added to
+    the covariance of the corners.
     """
     directions = (corners - intrinsics[2:]) / intrinsics[:2]
     points = np.stack([square(length) for length in lengths]) if len(lengths) else np.zeros((0, 4, 3))
@@ -134,18 +129,10 @@ def marker_poses(
 def _two_starts(
     points: FloatArray, directions: FloatArray, up: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Two initial poses of each square by Infinitesimal Plane-based Pose Estimation.
+    """Two initial rotations and positions of each square by IPPE; behind the camera: no pose.
 
     Collins and Bartoli, IJCV 2014: the perspective of a plane at its centre yields two rotations, mirrored
-    about the line of sight.
-
-    Args:
-        points: (N, 4, 3) corners in the marker's frame, clockwise from the upper left [m].
-        directions: (N, 4, 2) directions of the corners at distance 1.
-        up: (3,) in the camera frame, if the markers' y axes are known to point up.
-
-    Returns:
-        Rotations (N, 2, 3, 3) and positions (N, 2, 3) [m]; a position behind the camera means no pose.
+    about the line of sight. The y axes point `up` (3,), if that is given.
     """
     rotation = np.full((len(points), 2, 3, 3), np.nan)
     for n, (corners, seen) in enumerate(zip(points, directions + _UNALIGNED, strict=True)):
@@ -155,19 +142,15 @@ def _two_starts(
     none = ~np.isfinite(rotation).all(axis=(1, 2, 3))
     rotation[none] = 0.0
     if up is not None:
-        _set_upright(rotation, up)
+        # turn the y axes up and make the z axes level
+        out = rotation[..., 2] - (rotation[..., 2] @ up)[..., None] * up
+        length = np.linalg.norm(out, axis=-1)
+        turns = length > _LYING
+        out = out[turns] / length[turns, None]
+        rotation[turns] = np.stack([np.cross(up, out), np.broadcast_to(up, out.shape), out], axis=-1)
     position = _places(points, directions, rotation)
     position[none] = -1.0
     return rotation, position
-
-
-def _set_upright(rotation: FloatArray, up: FloatArray) -> None:
-    """Turn the y axes of rotations (N, 2, 3, 3) up and make their z axes level."""
-    out = rotation[..., 2] - (rotation[..., 2] @ up)[..., None] * up
-    length = np.linalg.norm(out, axis=-1)
-    turns = length > _LYING
-    out = out[turns] / length[turns, None]
-    rotation[turns] = np.stack([np.cross(up, out), np.broadcast_to(up, out.shape), out], axis=-1)
 
 
 def _places(points: FloatArray, directions: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -191,19 +174,11 @@ def body_pose(
     positions: FloatArray,
     upright: Upright | None = None,
 ) -> Poses:
-    """The pose of a body whose z axis points up, from several of its markers.
+    """The pose of a body from several of its markers: the best solution, and the best different one, if any.
 
-    Args:
-        points: (M, 4, 3) corners in the body's frame [m].
-        pixels: (M, 4, 2) in the image [ideal px].
-        covariance: (M, 8, 8) of each marker's corners [px^2].
-        intrinsics: (4,) fx, fy, cx, cy [px].
-        rotations: (S, 3, 3) initial rotations.
-        positions: (S, 3) initial positions [m].
-        upright: Given if the body is known to stand upright.
-
-    Returns:
-        The best solution, and the best different one, if any; N = 1.
+    Points (M, 4, 3) are the corners in the body's frame, whose z axis points up [m]; pixels (M, 4, 2) have a
+    covariance (M, 8, 8) [px^2]. Rotations (S, 3, 3) and positions (S, 3) are the initial ones; `upright` is
+    given if the body is known to stand upright.
     """
     weights = np.asarray(np.linalg.inv(covariance), np.float64)
     axis, flat = np.array([0.0, 0.0, 1.0]), (points.reshape(-1, 3), pixels.reshape(-1, 2))
@@ -252,16 +227,9 @@ def _refine_markers(
 
 @cached_njit
 def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covariance: FloatArray) -> float:
-    """Minimize the weighted squares of corners and tilt by Levenberg-Marquardt.
+    """Minimize the weighted squares of corners and tilt by Levenberg-Marquardt; infinite: no solution.
 
-    Args:
-        sight: The measurements.
-        rotation: (3, 3) initial value, and result.
-        position: (3,) initial value, and result.
-        covariance: (6, 6) filled.
-
-    Returns:
-        The sum of squares; infinite without a solution.
+    Rotation and position are the initial values, and the result; the covariance (6, 6) is filled.
     """
     normal, trial_normal = np.empty((6, 6)), np.empty((6, 6))
     slope, trial_slope, step = np.empty(6), np.empty(6), np.empty(6)
@@ -451,16 +419,17 @@ Body = Mapping[int, Placement]  # Marker id -> its pose on the body
 
 def robot_body(robot: Robot) -> Body:
     """The faces of a robot with a known yaw, in base_link."""
-    return {face.id: _placement(face, face.yaw) for face in robot.faces if face.yaw is not None}
-
-
-def _placement(face: Face, yaw: float) -> Placement:
-    """The pose of an upright face whose normal points along its yaw, or of a lying one whose x axis does."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
-    if face.lies:
-        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return Placement(rotation, np.array([face.x, face.y, face.z]), max(face.position_sigma, _MIN_SIGMA))
+    body = {}
+    for face in robot.faces:
+        if face.yaw is not None:
+            # the normal of an upright face points along its yaw, the x axis of a lying one
+            cos, sin = math.cos(face.yaw), math.sin(face.yaw)
+            rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
+            if face.lies:
+                rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            place, sigma = np.array([face.x, face.y, face.z]), max(face.position_sigma, _MIN_SIGMA)
+            body[face.id] = Placement(rotation, place, sigma)
+    return body
 
 
 def up_of(mount: CameraMount | FixedCamera) -> FloatArray:
@@ -481,13 +450,9 @@ class Seen:
 
 
 def solve_bodies(seen: Seen, bodies: Iterable[Body], intrinsics: FloatArray, upright: Upright | None) -> None:
-    """Replace the poses of markers that sit on one body by their common pose.
+    """Replace the poses of seen markers that sit on one body by their common pose.
 
-    Args:
-        seen: The markers; modified.
-        bodies: Bodies with several markers.
-        intrinsics: (4,) fx, fy, cx, cy [px].
-        upright: Given when bodies are known to stand upright.
+    `intrinsics` are fx, fy, cx, cy [px]; `upright` is given when bodies are known to stand upright.
     """
     solved = np.isfinite(seen.poses.chi2[:, 0])
     for body in bodies:
@@ -509,7 +474,13 @@ def _solve(
     points = np.stack(
         [square(seen.lengths[i]) @ at.rotation.T + at.position for i, at in zip(rows, places, strict=True)]
     )
-    starts = _starts(seen, rows, places)
+    # the body by each solution of each marker
+    rotations, positions = [], []
+    for i, at in zip(rows, places, strict=True):
+        for s in np.flatnonzero(np.isfinite(seen.poses.chi2[i])).tolist():
+            rotations.append(seen.poses.rotation[i, s] @ at.rotation.T)
+            positions.append(seen.poses.position[i, s] - rotations[-1] @ at.position)
+    starts = np.stack(rotations), np.stack(positions)
     own = [square(seen.lengths[i]) @ seen.poses.rotation[i, 0].T + seen.poses.position[i, 0] for i in rows]
     for _ in range(2):  # the effect of a shift depends on the faces' orientation, poor for a face alone
         shifts = [_shift_covariance(at.sigma, c, intrinsics) for at, c in zip(places, own, strict=True)]
@@ -529,23 +500,18 @@ def _solve(
             lever = rotation @ at.position
             seen.poses.rotation[i, s] = rotation @ at.rotation
             seen.poses.position[i, s] = position + lever
-            of_one = len(rows) * surplus * _moved(found.covariance[0, s], lever)
+            x, y, z = lever
+            move = np.eye(6)
+            move[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # d(position) = dt + omega x lever
+            of_one = len(rows) * surplus * (move @ found.covariance[0, s] @ move.T)
+            # the shifts of the faces have a common part, which moves the body, and individual parts, which
+            # show up as residuals; so the common part is left out, and what remains is positive
             if np.isfinite(found.chi2[0, s]):
-                _leave_out(added, of_one)
+                of_position = np.linalg.inv(np.linalg.inv(of_one)[:3, :3])  # for a known rotation
+                most = _MAX_LEFT_OUT * np.linalg.eigvalsh(of_position)[0]
+                of_one[:3, :3] -= min(added, most) * np.eye(3)
             seen.poses.covariance[i, s] = of_one
             seen.poses.chi2[i, s] = found.chi2[0, s] / surplus
-
-
-def _starts(seen: Seen, rows: Sequence[int], places: Sequence[Placement]) -> tuple[FloatArray, FloatArray]:
-    """Rotations and positions of the body by each solution of each marker."""
-    rotations, positions = [], []
-    for i, at in zip(rows, places, strict=True):
-        for s in range(2):
-            if np.isfinite(seen.poses.chi2[i, s]):
-                rotation = seen.poses.rotation[i, s] @ at.rotation.T
-                rotations.append(rotation)
-                positions.append(seen.poses.position[i, s] - rotation @ at.position)
-    return np.stack(rotations), np.stack(positions)
 
 
 def _shift_covariance(sigma: float, corners: FloatArray, intrinsics: FloatArray) -> FloatArray:
@@ -556,25 +522,6 @@ def _shift_covariance(sigma: float, corners: FloatArray, intrinsics: FloatArray)
     by_shift[0::2, 0], by_shift[0::2, 2] = fx / z, -fx * x / z**2
     by_shift[1::2, 1], by_shift[1::2, 2] = fy / z, -fy * y / z**2
     return np.asarray(sigma**2 * by_shift @ by_shift.T)
-
-
-def _leave_out(variance: float, covariance: FloatArray) -> None:
-    """Subtract a variance of the position from the covariance (6, 6) of a pose, which stays positive.
-
-    The shifts of the faces have a common part, which moves the body, and individual parts, which show up as
-    residuals. So the covariance contains the variance of the common part, up to errors of the pose.
-    """
-    of_position = np.linalg.inv(np.linalg.inv(covariance)[:3, :3])  # for a known rotation
-    most = _MAX_LEFT_OUT * np.linalg.eigvalsh(of_position)[0]
-    covariance[:3, :3] -= min(variance, most) * np.eye(3)
-
-
-def _moved(covariance: FloatArray, lever: FloatArray) -> FloatArray:
-    """The covariance (6, 6) of a pose at an offset (3,) in the camera frame."""
-    x, y, z = lever
-    move = np.eye(6)
-    move[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # d(position) = dt + omega x lever
-    return np.asarray(move @ covariance @ move.T)
 
 
 @dataclass(frozen=True)
@@ -593,25 +540,16 @@ class PoseSettings:
 
 
 class PoseSolver:
-    """Solves for the poses of markers.
-
-    Args:
-        settings: Settings of poses.
-        camera: The camera.
-        lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
-        up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
-        lying: Ids of markers that lie flat, to which `settings.tilt_sigma` does not apply.
-        bodies: Bodies that carry several markers.
-    """
+    """Solves for the poses of markers."""
 
     def __init__(
         self,
         settings: PoseSettings,
         camera: Camera,
-        lengths: Mapping[int, float],
-        up: FloatArray | None,
-        lying: Sequence[int],
-        bodies: Sequence[Body],
+        lengths: Mapping[int, float],  # Sides of markers that differ from `marker_length`, by id [m]
+        up: FloatArray | None,  # (3,) up in the camera frame, for `tilt_sigma`
+        lying: Sequence[int],  # Ids of markers that lie flat, to which `tilt_sigma` does not apply
+        bodies: Sequence[Body],  # Bodies that carry several markers
     ) -> None:
         self._intrinsics = camera.intrinsics
         self._length, self._lengths = settings.marker_length, lengths
@@ -622,18 +560,15 @@ class PoseSolver:
     def solve(self, ids: IntArray, corners: FloatArray, covariance: FloatArray) -> tuple[Poses, int]:
         """The poses of markers (N,) and the number of misfits.
 
-        Args:
-            ids: (N,).
-            corners: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
-            covariance: (N, 8, 8) of the corners [px^2].
+        Corners (N, 4, 2) go clockwise from the marker's own upper left [ideal px]; their covariance is
+        (N, 8, 8) [px^2].
         """
         lengths = np.array([self._lengths.get(int(i), self._length) for i in ids], dtype=float)
         poses, is_misfit = marker_poses(corners, covariance, lengths, self._intrinsics, self._upright)
         lies = np.isin(ids, self._lying)
         if self._upright is not None and lies.any():
-            again, is_misfit[lies] = marker_poses(
-                corners[lies], covariance[lies], lengths[lies], self._intrinsics
-            )
+            columns = corners[lies], covariance[lies], lengths[lies]
+            again, is_misfit[lies] = marker_poses(*columns, self._intrinsics)
             for column, new in zip(poses, again, strict=True):
                 column[lies] = new
         if self._bodies:

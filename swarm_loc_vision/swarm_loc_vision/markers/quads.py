@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
@@ -41,7 +40,9 @@ _SLACK_PX, _SLACK = 1.0, 0.05
 """Maximum distance of an outline from its side: pixels, and a share of its length. Points farther away, as at
 a gap or an obstacle on the border, are ignored."""
 _MIN_SEEN = 0.5  # Minimum share of a side that the outline covers
-_LEFT = 4  # Index of the direction to the left; the eight directions count counter-clockwise from the right
+_ACROSS, _DOWN = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, -1, -1, -1, 0, 1, 1, 1])
+"""The eight directions, counter-clockwise from the right [px]."""
+_LEFT = 4  # Index of the direction to the left
 _LONGEST_OUTLINE = 4  # Maximum number of points of an outline, relative to height plus width of the image
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 WINDOWS = ((7, 25), (35,))
@@ -49,17 +50,11 @@ WINDOWS = ((7, 25), (35,))
 
 
 def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bool = False) -> FloatArray:
-    """Find dark quadrangles in full and in half resolution, without duplicates.
+    """(N, 4, 2) corners [px] of dark quadrangles, clockwise in the image, on the boundary of dark and light.
 
-    Args:
-        gray: (height, width).
-        min_side: Minimum side of a quadrangle [px].
-        min_contrast: Minimum difference from the local mean [counts]; raised for noisy images.
-        touching: Whether quadrangles may touch others at their corners: the dark areas are then eroded by a
-            pixel, and the sides lie up to a pixel too far inside.
-
-    Returns:
-        (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
+    Quadrangles have a minimum side [px] and contrast to the local mean [counts], which noise raises. Where
+    they may touch others at their corners, dark areas are eroded by a pixel, and the sides lie up to a pixel
+    too far inside.
     """
     scaled: NDArray[Any] = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
     found: list[FloatArray] = []
@@ -73,53 +68,64 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bo
             scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
         contrast = max(min_contrast, _NOISE_SIGMAS * _noise(scaled))
         for window in windows:
-            dark = _dark(scaled, window, contrast)
+            # 255 where darker than the local mean; the frame is 0, so that outlines stay inside
+            dark: NDArray[Any] = cv2.blur(scaled, (window, window))
+            cv2.subtract(dark, scaled, dst=dark)  # in place: new arrays of this size cost as much as the rest
+            cv2.threshold(dark, contrast - 0.5, _DARK, cv2.THRESH_BINARY, dst=dark)
+            surplus = -dark.shape[1] % 8
+            if surplus:
+                dark = cv2.copyMakeBorder(dark, 0, 0, 0, surplus, cv2.BORDER_CONSTANT, value=0)
+            dark[[0, -1]] = 0
+            dark[:, [0, -1 - surplus]] = 0
             if touching:
                 dark = np.asarray(cv2.erode(dark, _CROSS), np.uint8)
-            quads = _quads(dark, min_side / scale)
+            rows, columns = dark.shape
+            points = np.empty((_LONGEST_OUTLINE * (rows + columns), 2), np.int32)
+            ahead = _ACROSS + columns * _DOWN
+            quads = _follow(dark.reshape(-1), dark.view(np.uint64), ahead, min_side / scale, points)
             found.append((quads + 0.5) * scale - 0.5)
-    return _distinct(np.concatenate([np.zeros((0, 4, 2)), *found]))
-
-
-def _distinct(quads: FloatArray) -> FloatArray:
-    """Remove quadrangles with the position and size of an earlier one."""
-    if not len(quads):
-        return quads
+    # without those at the place and of the size of an earlier one
+    quads = np.concatenate([np.zeros((0, 4, 2)), *found])
     middle = quads.mean(axis=1)
     size = np.abs(quads - middle[:, None]).mean(axis=(1, 2))
-    places = np.column_stack([middle, size])
-    same = KDTree(places).query_ball_point(places, _SAME * size, p=np.inf, return_sorted=True)
-    return quads[[near[0] == i for i, near in enumerate(same)]]
+    return quads[apart(np.column_stack([middle, size]), _SAME * size, np.arange(len(quads)))]
 
 
-def _dark(gray: NDArray[Any], window: int, contrast: float) -> NDArray[np.uint8]:
-    """255 where an image is darker than the local mean; its frame is 0, so that outlines stay inside."""
-    dark = cv2.blur(gray, (window, window))
-    cv2.subtract(dark, gray, dst=dark)  # in place: new arrays of this size cost as much as the rest
-    cv2.threshold(dark, contrast - 0.5, _DARK, cv2.THRESH_BINARY, dst=dark)
-    surplus = -dark.shape[1] % 8
-    if surplus:
-        dark = cv2.copyMakeBorder(dark, 0, 0, 0, surplus, cv2.BORDER_CONSTANT, value=0)
-    dark[[0, -1]] = 0
-    dark[:, [0, -1 - surplus]] = 0
-    return np.asarray(dark, np.uint8)
+@cached_njit
+def apart(places: FloatArray, reaches: FloatArray, order: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) which places (N, K) are chosen: in an order, those beyond their reach from all chosen before."""
+    kept = np.zeros(len(places), np.bool_)
+    for m in range(len(order)):
+        i = order[m]
+        kept[i] = True
+        for n in range(m):
+            j = order[n]
+            if not kept[j] or abs(places[i, 0] - places[j, 0]) > reaches[i]:
+                continue
+            away = 0.0
+            for c in range(places.shape[1]):
+                away += (places[i, c] - places[j, c]) ** 2
+            if away <= reaches[i] ** 2:
+                kept[i] = False
+                break
+    return kept
 
 
-def _noise(gray: NDArray[Any]) -> float:
+@cached_njit
+def _noise(gray: Gray) -> float:
     """Standard deviation of the noise [counts], from second differences, which suppress the image itself."""
-    rows = gray[::_NOISE_ROWS].astype(np.int16)
-    sizes = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]).ravel()
-    at_most = np.cumsum(np.bincount(sizes))  # their median by counting
-    middle = np.searchsorted(at_most, [(sizes.size - 1) // 2, sizes.size // 2], side="right")
-    return _DEVIATION * float(middle.mean())
-
-
-def _quads(dark: NDArray[np.uint8], min_side: float) -> FloatArray:
-    """(N, 4, 2) quadrangles among the outlines."""
-    height, width = dark.shape
-    points = np.empty((_LONGEST_OUTLINE * (height + width), 2), np.int32)
-    ahead = np.array([1, 1 - width, -width, -width - 1, -1, width - 1, width, width + 1])
-    return _follow(dark.reshape(-1), dark.view(np.uint64), ahead, min_side, points)
+    counts = np.zeros(4 * _DARK + 1, np.int64)
+    for v in range(0, gray.shape[0], _NOISE_ROWS):
+        row = gray[v]
+        for u in range(1, len(row) - 1):
+            counts[abs(int(row[u - 1]) - 2 * int(row[u]) + int(row[u + 1]))] += 1
+    at_most = np.cumsum(counts)  # their median by counting
+    half = at_most[-1] // 2
+    low, high = (
+        np.searchsorted(at_most, (at_most[-1] - 1) // 2, "right"),
+        np.searchsorted(at_most, half, "right"),
+    )
+    return float(_DEVIATION * 0.5 * (low + high))
 
 
 @cached_njit
@@ -130,14 +136,11 @@ def _follow(
     min_side: float,
     points: IntArray,
 ) -> FloatArray:
-    """Follow each outline once and keep quadrangles.
+    """Follow each outline once and keep quadrangles with sides of `min_side` [px].
 
-    Args:
-        dark: (height * width) 255 where dark; modified, see `_FOLLOWED`.
-        eights: (height, width / 8) the same memory.
-        ahead: (8,) offsets of the neighbours of a pixel in the eight directions.
-        min_side: Minimum side of a quadrangle [px].
-        points: Memory for an outline; longer ones are rejected.
+    `dark` (height * width) is 255 where dark, and modified, see `_FOLLOWED`; `eights` (height, width / 8) is
+    the same memory. `ahead` (8,) are the offsets of a pixel's neighbours. Outlines longer than `points` are
+    rejected.
     """
     height, words = eights.shape
     width = 8 * words
@@ -156,11 +159,7 @@ def _follow(
                 length = _outline(dark, ahead, start, points)
                 if length < min_points or length > len(points):
                     continue
-                for i in range(length):
-                    place = points[i, 0]
-                    points[i, 1] = place // width
-                    points[i, 0] = place - width * points[i, 1]
-                if not _quadrangle(points, length, min_side, quad):
+                if not _quadrangle(points, length, start - v * width, v, min_side, quad):
                     continue
                 if count == len(quads):
                     larger = np.empty((2 * count, 4, 2))
@@ -173,12 +172,10 @@ def _follow(
 
 @cached_njit
 def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, points: IntArray) -> int:
-    """Follow the outline through a dark pixel that is light to its left.
+    """Follow the outline through a dark pixel that is light to its left; returns the number of its points.
 
-    Border following of Suzuki and Abe (1985), 8-connected.
-
-    Returns:
-        Number of its points. Those that fit are written to points[:, 0], as indices of `dark`.
+    Border following of Suzuki and Abe (1985), 8-connected. The directions to the next point are written to
+    points[:, 1], where they fit.
     """
     dark[start] = _FOLLOWED
     back = -1
@@ -192,14 +189,14 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
     end = start + ahead[back]
     here, length = start, 0
     while True:
-        if length < len(points):
-            points[length, 0] = here
-        length += 1
         direction = (back + 1) & 7  # counter-clockwise from the previous pixel
         while dark[here + ahead[direction]] == 0:
             if direction == _LEFT:
                 dark[here] = _FOLLOWED
             direction = (direction + 1) & 7
+        if length < len(points):
+            points[length, 1] = direction
+        length += 1
         there = here + ahead[direction]
         if there == start and here == end:
             return length
@@ -207,30 +204,29 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
 
 
 @cached_njit
-def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray) -> bool:
-    """Whether an outline is a dark quadrangle; fills its corners."""
-    twice_area = 0
+def _quadrangle(
+    points: IntArray, length: int, start_u: int, start_v: int, min_side: float, quad: FloatArray
+) -> bool:
+    """Whether an outline of `_outline` is a dark quadrangle; fills its corners."""
+    # its points, their box and sum, and twice its area
+    u, v, twice_area, sum_u, sum_v = start_u, start_v, 0, 0, 0
+    low_u, high_u, low_v, high_v = u, u, v, v
     for i in range(length):
-        j = i + 1 if i + 1 < length else 0
-        twice_area += points[i, 0] * points[j, 1] - points[j, 0] * points[i, 1]
+        direction = points[i, 1]
+        points[i, 0], points[i, 1] = u, v
+        du, dv = _ACROSS[direction], _DOWN[direction]
+        twice_area += u * dv - v * du
+        sum_u, sum_v = sum_u + u, sum_v + v
+        low_u, high_u = min(low_u, u), max(high_u, u)
+        low_v, high_v = min(low_v, v), max(high_v, v)
+        u, v = u + du, v + dv
     # counter-clockwise in the image: negative, as v points down; outlines of holes are positive
-    if twice_area >= 0:
+    least = max(_MIN_AREA * min_side**2, _MIN_COMPACTNESS * length**2, -0.375 * twice_area)
+    if twice_area >= 0 or (high_u - low_u) * (high_v - low_v) < least:
         return False
+    # the four points that span the largest quadrangle
     corners = np.empty(4, np.int64)
-    area = _corner_points(points, length, corners)
-    if area < max(_MIN_AREA * min_side**2, _MIN_COMPACTNESS * length**2, -0.375 * twice_area):
-        return False
-    return _sides(points, length, corners, min_side, quad)
-
-
-@cached_njit
-def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) -> float:
-    """Fill ascending indices of the four points that span the largest quadrangle; returns its area."""
-    mean_u, mean_v = 0.0, 0.0
-    for i in range(length):
-        mean_u += points[i, 0]
-        mean_v += points[i, 1]
-    mean_u, mean_v = mean_u / length, mean_v / length
+    mean_u, mean_v = sum_u / length, sum_v / length
     first, farthest = 0, -1.0
     for i in range(length):
         distance = (points[i, 0] - mean_u) ** 2 + (points[i, 1] - mean_v) ** 2
@@ -245,15 +241,20 @@ def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) ->
     corners[1] = _farthest(points, length, first, third)
     corners[3] = _farthest(points, length, third, first)
     for _ in range(2):
+        has_moved = False
         for k in range(4):
-            corners[k] = _farthest(points, length, corners[k - 1], corners[(k + 1) % 4])
+            best = _farthest(points, length, corners[k - 1], corners[(k + 1) % 4])
+            has_moved |= best != corners[k]
+            corners[k] = best
+        if not has_moved:
+            break
     twice = 0
     for k in range(4):
         a, b = corners[k - 1], corners[k]
         if a == b:
-            return 0.0
+            return False
         twice += points[a, 0] * points[b, 1] - points[b, 0] * points[a, 1]
-    return -0.5 * twice
+    return -0.5 * twice >= least and _sides(points, length, corners, min_side, quad)
 
 
 @cached_njit
@@ -275,10 +276,7 @@ def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
 def _sides(
     points: IntArray, length: int, corners: NDArray[np.int64], min_side: float, quad: FloatArray
 ) -> bool:
-    """Whether an outline is straight between its corners; fills the intersections of the sides.
-
-    The lines are moved outwards by half a pixel, from the outermost dark pixels to the boundary.
-    """
+    """Whether an outline is straight between its corners; fills the intersections of the sides."""
     lines = np.empty((4, 3))  # normal (outwards) and offset
     for k in range(4):
         # the chord between two corners
@@ -317,6 +315,7 @@ def _sides(
             return False
         if normal_u * -dv + normal_v * du > 0.0:  # dark is on the left, outwards is right
             normal_u, normal_v = -normal_u, -normal_v
+        # half a pixel outwards, from the outermost dark pixels to the boundary
         lines[k, 0], lines[k, 1] = normal_u, normal_v
         lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5
     # neighbouring lines meet near the corners of the outline

@@ -242,19 +242,13 @@ def _pitch(room: float, count: int, least: float) -> float | None:
 
 def floor_markers(board: Page) -> tuple[FloorMarker, ...]:
     """The markers of a board on the floor, in a map with its middle as origin and x to the right."""
-    middles = {
-        piece.sticker.id: (piece.x + 0.5 * piece.sticker.side, piece.y + 0.5 * piece.sticker.side)
-        for piece in board.pieces
-    }
-    x, y = (0.5 * (min(values) + max(values)) for values in zip(*middles.values(), strict=True))
+    middles = np.array([(piece.x, piece.y) for piece in board.pieces])
+    middles += 0.5 * np.array([[piece.sticker.side] for piece in board.pieces])
+    places = np.round(1e-3 * (middles - 0.5 * (middles.min(axis=0) + middles.max(axis=0))), 6).tolist()
+    stickers = [piece.sticker for piece in board.pieces]
     return tuple(
-        FloorMarker(
-            piece.sticker.id,
-            round(1e-3 * (middles[piece.sticker.id][0] - x), 6),
-            round(1e-3 * (middles[piece.sticker.id][1] - y), 6),
-            size=1e-3 * piece.sticker.side,
-        )
-        for piece in board.pieces
+        FloorMarker(sticker.id, x, y, size=1e-3 * sticker.side)
+        for sticker, (x, y) in zip(stickers, places, strict=True)
     )
 
 
@@ -282,10 +276,7 @@ def _grid(text: str) -> list[int]:
     __doc__,
     argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description"),
     argument(
-        "--out",
-        type=file_to_write(".pdf"),
-        default="markers.pdf",
-        help="the PDF (default: markers.pdf)",
+        "--out", type=file_to_write(".pdf"), default="markers.pdf", help="the PDF (default: markers.pdf)"
     ),
     argument(
         "--family", choices=list(families()), default="artoolkit_bch_thin", help="as of marker_detector_node"

@@ -1,7 +1,5 @@
 """The aerial camera node over DDS: overhead images in, anonymous detections in map out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

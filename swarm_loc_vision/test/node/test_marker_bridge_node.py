@@ -1,7 +1,5 @@
 """The marker bridge over DDS: markers of another detector in, detections with covariances out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec

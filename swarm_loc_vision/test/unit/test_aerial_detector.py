@@ -1,7 +1,5 @@
 """The aerial detector on drawn pictures: all robots that are there are found, and nothing else."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

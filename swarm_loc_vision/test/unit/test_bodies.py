@@ -1,7 +1,5 @@
 """Faces of one robot together."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A bag of images made a bag of detections: what is found, what it replays to, and what is dropped."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole detector on rendered images and, where they are at hand, on photographs."""
 
-from __future__ import annotations
-
 import json
 import math
 import tracemalloc

@@ -1,7 +1,5 @@
 """Blinking lights in events: where they are, how sure that is, and what is none of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blinking_lights import SIZE, light, noise, together

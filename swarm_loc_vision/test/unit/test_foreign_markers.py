@@ -1,7 +1,5 @@
 """Markers of other detectors: their conventions of corners and poses, and what is dropped."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

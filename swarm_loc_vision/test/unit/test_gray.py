@@ -1,7 +1,5 @@
 """Encodings of images."""
 
-from __future__ import annotations
-
 import zlib
 from types import SimpleNamespace
 

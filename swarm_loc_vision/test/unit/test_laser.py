@@ -1,7 +1,5 @@
 """Laser calibration: the hyperbola is found again, distances say how sure they are, files are checked."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sheets of markers: in true size, read by detectors, and every id on them."""
 
-from __future__ import annotations
-
 import io
 import re
 import zlib

@@ -1,7 +1,5 @@
 """Sides fitted to pixels: no bias wherever edges lie in the pixels, and as sure as they say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,9 +12,16 @@ from scipy.special import ndtr
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.edges import NEW_CAMERA, Corners, refine, refine_read
 from swarm_loc_vision.markers.families import family_named
-from swarm_loc_vision.markers.side_pixels import INNER, side_pixels
+from swarm_loc_vision.markers.lines import Corners, homographies, refine
+from swarm_loc_vision.markers.sides import (
+    NEW_CAMERA,
+    REACH_PX,
+    collect,
+    empty_pixels,
+    lens_shifts,
+    refine_read,
+)
 
 FAMILY = family_named("artoolkit_bch_thin")
 INK, PAPER = 30.0, 200.0
@@ -196,11 +201,13 @@ def test_the_lens_is_undone_at_every_pixel_next_to_a_side(k1: float, place: tupl
     quad = camera.to_ideal(
         np.array(place) + 60.0 * np.array([[0.0, 0.1], [1.0, 0.0], [0.9, 1.0], [0.1, 0.8]])
     )
-    pixels = side_pixels(np.zeros((960, 1280), np.uint8), camera.lens, quad[None], 8, 1)
-    count = int(pixels.counts[0])
+    pixels, image = empty_pixels(8), np.zeros((960, 1280), np.uint8)
+    plane, shifts = homographies(quad[None])[0], lens_shifts(camera.lens, quad[None])[0]
+    collect(image, quad, plane, shifts, 1, REACH_PX, pixels)
+    count = int(pixels.first[4])
     assert count > 500
-    frame = pixels.frames[0, pixels.side[0, :count] % INNER]
-    along, outside = pixels.along[0, :count, None], pixels.outside[0, :count, None]
+    frame = np.repeat(pixels.frames, np.diff(pixels.first), axis=0)
+    along, outside = pixels.along[:count, None], pixels.outside[:count, None]
     normal = np.column_stack([frame[:, 3], -frame[:, 2]])
     raw = camera.to_raw(frame[:, :2] + along * frame[:, 2:4] + outside * normal)
     error = np.abs(raw - np.rint(raw)).max(axis=1)

@@ -1,7 +1,5 @@
 """Cameras over a floor with known poses, for tests of the aerial detector."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

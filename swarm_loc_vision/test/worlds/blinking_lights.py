@@ -1,7 +1,5 @@
 """Events of blinking lights for tests, made apart from the emulator: bursts of the pixels around a place."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray

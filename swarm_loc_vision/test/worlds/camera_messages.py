@@ -1,7 +1,5 @@
 """Messages of the scenes' camera, as tests of the vision package share them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -43,8 +43,7 @@ from swarm_loc_estimator.common.parameters import UserError
 
 RawMessage = tuple[str, str, int, bytes]  # Topic, type, log time [ns], serialized message
 
-MAX_LOG_NS = 2**62
-"""Log times lie between 0 and here [ns], in the year 2116, so that the difference of any two is a number."""
+MAX_LOG_NS = 2**62  # Log times lie between 0 and here [ns], the year 2116: differences are numbers, too
 
 
 class BagError(UserError):
@@ -190,9 +189,8 @@ class McapFile:
                 log_ns = self._load(stretch, None).log_ns
                 self.message_count += log_ns.size
                 if log_ns.size:
-                    self._stretches[k] = stretch._replace(
-                        first_ns=int(log_ns.min()), last_ns=int(log_ns.max())
-                    )
+                    first_ns, last_ns = int(log_ns.min()), int(log_ns.max())
+                    self._stretches[k] = stretch._replace(first_ns=first_ns, last_ns=last_ns)
             if end is not None:
                 kept = f"the {self.message_count} messages before that were kept"
                 lost = "what was written behind them is lost"
@@ -208,10 +206,8 @@ class McapFile:
             if summary is None or summary.statistics is None:
                 return False
             for one in summary.chunk_indexes:
-                offset, times = (
-                    one.chunk_start_offset + _RECORD.size,
-                    (one.message_start_time, one.message_end_time),
-                )
+                offset = one.chunk_start_offset + _RECORD.size
+                times = one.message_start_time, one.message_end_time
                 self._file.seek(offset)
                 if _TIMES.unpack(self._file.read(_TIMES.size)) != times or times[1] > MAX_LOG_NS:
                     return False
@@ -275,7 +271,7 @@ class McapFile:
         self._bytes_read += stretch.size
         self._file.seek(stretch.offset)
         if not stretch.is_chunk:
-            return self._find_messages(self._file.read(stretch.size), number_of)[0]
+            return self._messages(self._file.read(stretch.size), number_of)[0]
         chunk_name = f"the chunk at byte {stretch.offset}"
         try:
             chunk = Chunk.read(ReadDataStream(self._file))
@@ -293,14 +289,12 @@ class McapFile:
         elif chunk.uncompressed_crc not in {0, zlib.crc32(data)} and not stretch.is_cut:
             self.losses.add(f"{chunk_name} is damaged, its checksum is wrong.")
             return MessageBatch.of([])
-        messages, end = self._find_messages(data, number_of)
+        messages, end = self._messages(data, number_of)
         if end != len(data) and not stretch.is_cut:
             self.losses.add(f"{chunk_name} is damaged behind its byte {end}.")
         return messages
 
-    def _find_messages(
-        self, data: bytes, number_of: Mapping[BagTopic, int] | None
-    ) -> tuple[MessageBatch, int]:
+    def _messages(self, data: bytes, number_of: Mapping[BagTopic, int] | None) -> tuple[MessageBatch, int]:
         """The messages of unpacked records, and the offset after the last whole record."""
         numbers, offset, size = self._numbers(number_of), 0, len(data)
         rows: list[tuple[int, int, int, int]] = []
@@ -337,10 +331,8 @@ class McapFile:
 def unpack(chunk: Chunk) -> bytes:
     """The records of a chunk, one byte more than it should hold at most; of one cut off, what can be had.
 
-    The library would unpack whatever the content says, however large.
-
-    Raises:
-        ValueError, RuntimeError, zstandard.ZstdError: It is damaged.
+    The library would unpack whatever the content says, however large. Raises ValueError, RuntimeError or
+    zstandard.ZstdError where it is damaged.
     """
     size = chunk.uncompressed_size
     if chunk.compression == "":
@@ -427,10 +419,8 @@ class SqliteFile:
         rows = self._connection.execute(_TOPICS).fetchall()
         if self._connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
             raise sqlite3.DatabaseError("database disk image is malformed")
-        self._topics = {
-            number: BagTopic(str(name).lstrip("/"), str(kind), str(encoding))
-            for number, name, kind, encoding in rows
-        }
+        columns = ((number, str(name).lstrip("/"), str(kind), str(code)) for number, name, kind, code in rows)
+        self._topics = {number: BagTopic(*topic) for number, *topic in columns}
         self._connection.execute(f"EXPLAIN {_MESSAGES}")
         (stored,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
         query = f"SELECT count(*), min(timestamp), max(timestamp) FROM messages {_TIMED}"  # noqa: S608
@@ -454,7 +444,6 @@ class SqliteFile:
         self._connection = _connect(whole)
 
     def _open_rescued(self, error: sqlite3.Error) -> None:
-        """Copy what can be read to a new file and open that."""
         folder = self._rescue.enter_context(temporary_folder("rescued_bag_"))
         self._leave_half_page(folder)
         rescued = sqlite3.connect(folder / "rescued.db3", isolation_level=None)

@@ -1,7 +1,4 @@
-"""Reading bags: rosbag2 folders and bare files, MCAP and sqlite3, whole or cut off by a crash.
-
-What rosbag2 and others compress beyond the chunks of MCAP: whole files, and single messages.
-"""
+"""Reading bags: rosbag2 folders and bare files, MCAP and sqlite3, plain or compressed, whole or cut off."""
 
 from __future__ import annotations
 
@@ -11,10 +8,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
@@ -32,9 +30,6 @@ from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 
-if TYPE_CHECKING:
-    from rosbags.interfaces import Qos
-
 PACKED = (".zstd", ".zst", ".lz4")  # Suffixes of compressed files, as in bag_0.db3.zstd
 MAX_MESSAGE = 1 << 28  # Unpacked messages are at most so large [byte]
 
@@ -47,10 +42,8 @@ _ERRORS = (zstandard.ZstdError, EOFError, RuntimeError)
 def unpack_file(path: Path, folder: Path, losses: list[str]) -> Path:
     """Unpack a file with a suffix of `PACKED` into a folder; of a damaged one, the part before the damage.
 
-    A sentence about a damaged file is added to `losses`.
-
-    Raises:
-        BagError: It is no file, or needs more than half of the free disk space.
+    A sentence about damage is added to `losses`. Raises BagError if it is no file, or needs more than half of
+    the free disk space.
     """
     if not path.is_file():
         raise BagError(f"{path} is no file.")  # opening a pipe would never return
@@ -107,21 +100,17 @@ __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 
 BagFile = McapFile | SqliteFile
 _STORAGES: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile}
-_METADATA_BYTES = 20_000_000
-"""Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
+_METADATA_BYTES = 20_000_000  # Larger metadata are not read; a thousand robots' topics take a tenth of it
 _ENCODINGS = ("cdr", "")
 _EXPECTED = "expected a rosbag2 folder, or an .mcap or .db3 file, plain or compressed as .zstd, .zst or .lz4"
 _ROS_1 = "convert bags of ROS 1 first: rosbags-convert --src NAME.bag --dst NAME"
 
 
 class BagReader:
-    """An open bag; use it as a context manager.
+    """An open bag, as a context manager: a rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
 
-    Topic names come without the leading slash, as `robot1/odom`.
-
-    Args:
-        path: A rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
-        renamed: Topic of the bag -> the name that it has here; a topic of that name in the bag is hidden.
+    Topic names come without the leading slash, as `robot1/odom`. `renamed` has by topic of the bag the name
+    that it has here; a topic of that name in the bag is hidden.
 
     Raises:
         BagError: There is nothing to read.
@@ -269,14 +258,10 @@ class BagReader:
         recorded = self._listed()
         paths = sorted(filter(is_storage, path.iterdir()), key=_part_number)
         paths = [one for one in paths if one.suffix in _STORAGES or one.with_suffix("") not in paths]
-        self._own_losses += [
-            f"{name}: the file is missing, its messages are lost."
-            for name in recorded
-            if not (self._path / name).exists()
-        ]
+        missing = [name for name in recorded if not (self._path / name).exists()]
+        self._own_losses += [f"{name}: the file is missing, its messages are lost." for name in missing]
         if not paths:
-            ros_1 = any(one.suffix == ".bag" for one in path.iterdir())
-            hint = _ROS_1 if ros_1 else _EXPECTED
+            hint = _ROS_1 if any(one.suffix == ".bag" for one in path.iterdir()) else _EXPECTED
             raise BagError(f"'{path}' holds no .mcap or .db3 file: {hint}.")
         return paths
 
@@ -309,11 +294,7 @@ def _part_number(path: Path) -> tuple[int, str]:
 
 
 def offered_qos(metadata: dict[str, Any]) -> dict[str, list[Qos]]:
-    """The profiles of each topic's publishers, by its name without the leading slash.
-
-    `metadata` is what stands below `rosbag2_bagfile_information`; topics that are not described as they
-    should be have no profiles.
-    """
+    """The profiles of publishers by topic, from a folder's metadata; malformed parts have none."""
     topics = metadata.get("topics_with_message_count")
     profiles: dict[str, list[Qos]] = {}
     for topic in topics if isinstance(topics, list) else []:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -52,11 +51,7 @@ LATCHED = RELIABLE._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy and of this workspace, as `rosbags` holds them.
-
-    Raises:
-        DefinitionsNotFoundError: The workspace's `.msg` files are not there.
-    """
+    """The types of ROS 2 Jazzy and of this workspace; raises DefinitionsNotFoundError without the latter."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
     for path in sorted(message_folder().glob("*.msg")):
@@ -83,31 +78,25 @@ class _McapStorage:
         self._channels: dict[int, int] = {}
 
     def add_msgtype(self, connection: Connection) -> None:
-        """Add the type of a topic."""
-        definition = connection.msgdef.data.encode()
-        schema = self._writer.register_schema(connection.msgtype, "ros2msg", definition)
+        schema = self._writer.register_schema(connection.msgtype, "ros2msg", connection.msgdef.data.encode())
         self._schemas[connection.msgtype] = schema
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Add a topic."""
         metadata = {"offered_qos_profiles": offered_qos_profiles, "topic_type_hash": connection.digest}
-        self._channels[connection.id] = self._writer.register_channel(
-            connection.topic, "cdr", self._schemas[connection.msgtype], metadata
-        )
+        schema = self._schemas[connection.msgtype]
+        number = self._writer.register_channel(connection.topic, "cdr", schema, metadata)
+        self._channels[connection.id] = number
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Add a message."""
         self._writer.add_message(self._channels[connection.id], timestamp, bytes(data), timestamp)
 
     def close(self, version: int, metadata: str) -> None:
-        """End the file."""
         del version
         with self._file:
             self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
             self._writer.finish()  # type: ignore[no-untyped-call]
 
     def abort(self) -> None:
-        """Close the file as it is."""
         self._file.close()
 
 
@@ -118,10 +107,9 @@ class _Rosbag2Writer(Writer):
 
 
 class BagWriter:
-    """A new bag; use it as a context manager, after whose end without an error it is there.
+    """A new bag, as a context manager, after whose end without an error it is there.
 
-    Its folder must not exist. With `compress`, chunks are compressed with zstd. Other files of it are written
-    to `folder` before the end.
+    With `compress`, chunks are compressed with zstd. Other files of it go to `folder` before the end.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -146,11 +134,7 @@ class BagWriter:
             self._stack = stack.pop_all()
 
     def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
-        """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
-
-        Names are written fully qualified, as a recorder writes them. The publisher of a latched one is said
-        to have kept the newest message for late subscribers.
-        """
+        """Announce a topic, such as robot1/odom; of a latched one late subscribers get the newest message."""
         topic = "/" + name.lstrip("/")
         self._connections[name] = self._writer.add_connection(
             topic,
@@ -167,9 +151,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         with self._stack, naming(self._path):
             if kind is None:
                 self._writer.close()
@@ -196,13 +178,10 @@ def write_streams(
     progress: Callable[[float], None] = lambda _: None,
     add: Callable[[Path], object] = lambda _: None,
 ) -> int:
-    """Write messages as a new, compressed bag in order of log time, equal times in the order of the streams.
+    """Write messages as a new, compressed bag by log time, equal times in the order of the streams.
 
     `progress` is called now and then with the share done, `add` with the folder for other files. Returns the
-    number of messages.
-
-    Raises:
-        BagError: The folder is there already, or cannot be created.
+    number of messages. Raises BagError if the folder is there already, or cannot be created.
     """
     log_ns = np.concatenate([stream.log_ns for stream in streams])
     owner = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])

@@ -2,11 +2,7 @@
 
 A subscription with `raw=True` and a bag both deliver the serialized message. Plain CDR (XCDR1) is read in
 both byte orders and written in little-endian. `streams` reads frequent messages many at a time, in compiled
-code.
-
-The types of ROS messages that the workspace uses, as fields read from `.msg` definitions.
-
-The standard types stand here as text, this workspace's own are read from the `.msg` files of
+code. The standard types stand here as text, this workspace's own are read from the `.msg` files of
 `swarm_loc_msgs`, each when it is first used. To load the definitions of all ROS packages with `rosbags`
 would cost a node 0.16 s at start.
 """
@@ -29,31 +25,20 @@ from swarm_loc_estimator.common.parameters import UserError
 
 MESSAGE_PACKAGE = "swarm_loc_msgs"
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-IMU = "sensor_msgs/msg/Imu"
-RANGE = "sensor_msgs/msg/Range"
-LASER_SCAN = "sensor_msgs/msg/LaserScan"
-OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
-POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+ODOMETRY, OCCUPANCY_GRID = "nav_msgs/msg/Odometry", "nav_msgs/msg/OccupancyGrid"
+IMU, RANGE, LASER_SCAN = "sensor_msgs/msg/Imu", "sensor_msgs/msg/Range", "sensor_msgs/msg/LaserScan"
+POSE_STAMPED, TRANSFORM_STAMPED = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
-MARKERS = "visualization_msgs/msg/MarkerArray"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-ANONYMOUS_DETECTION = f"{MESSAGE_PACKAGE}/msg/AnonymousDetection"
-DETECTIONS = f"{MESSAGE_PACKAGE}/msg/MarkerDetectionArray"
-DETECTION = f"{MESSAGE_PACKAGE}/msg/MarkerDetection"
-BRIGHTNESS = f"{MESSAGE_PACKAGE}/msg/BrightnessMatrix"
-ANONYMOUS_DETECTIONS = f"{MESSAGE_PACKAGE}/msg/AnonymousDetectionArray"
-ROBOT_IDENTITIES = f"{MESSAGE_PACKAGE}/msg/RobotIdentities"
-SWARM_ODOMETRY = f"{MESSAGE_PACKAGE}/msg/SwarmOdometry"
-SWARM_DETECTIONS = f"{MESSAGE_PACKAGE}/msg/SwarmDetections"
-SWARM_FIXES = f"{MESSAGE_PACKAGE}/msg/SwarmFixes"
-SWARM_POSES = f"{MESSAGE_PACKAGE}/msg/SwarmPoses"
-SWARM_SIGHTINGS = f"{MESSAGE_PACKAGE}/msg/SwarmSightings"
-RANGES = f"{MESSAGE_PACKAGE}/msg/RangeArray"
-LASER = f"{MESSAGE_PACKAGE}/msg/LaserDistance"
-LIGHTS = f"{MESSAGE_PACKAGE}/msg/LightBearingArray"
-EVENT_PACKETS = ("event_camera_msgs/msg/EventPacket", f"{MESSAGE_PACKAGE}/msg/EventPacket")
+MARKERS, TRANSFORMS = "visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"
+_OWN = f"{MESSAGE_PACKAGE}/msg"
+DETECTION, DETECTIONS = f"{_OWN}/MarkerDetection", f"{_OWN}/MarkerDetectionArray"
+ANONYMOUS_DETECTION, ANONYMOUS_DETECTIONS = f"{_OWN}/AnonymousDetection", f"{_OWN}/AnonymousDetectionArray"
+BRIGHTNESS, ROBOT_IDENTITIES = f"{_OWN}/BrightnessMatrix", f"{_OWN}/RobotIdentities"
+RANGES, LASER, LIGHTS = f"{_OWN}/RangeArray", f"{_OWN}/LaserDistance", f"{_OWN}/LightBearingArray"
+SWARM_ODOMETRY, SWARM_DETECTIONS = f"{_OWN}/SwarmOdometry", f"{_OWN}/SwarmDetections"
+SWARM_FIXES, SWARM_POSES = f"{_OWN}/SwarmFixes", f"{_OWN}/SwarmPoses"
+SWARM_SIGHTINGS = f"{_OWN}/SwarmSightings"
+EVENT_PACKETS = ("event_camera_msgs/msg/EventPacket", f"{_OWN}/EventPacket")
 """The type of events and our copy of it, with the same fields: nodes use the first one that is installed."""
 
 STANDARD = """
@@ -142,13 +127,10 @@ SEQUENCE = -1  # In place of a length: it varies and stands before the elements
 
 @lru_cache(maxsize=1)
 def message_folder() -> Path:
-    """The folder with this workspace's `.msg` files.
+    """The folder with this workspace's `.msg` files; raises DefinitionsNotFoundError if it is not found.
 
     It lies in this package: as a link in a source tree, with its content in a wheel. In a package that was
-    built without its neighbours the link leads nowhere; then it is found as ROS does, on AMENT_PREFIX_PATH.
-
-    Raises:
-        DefinitionsNotFoundError: It is in neither place.
+    built without its neighbours the link leads nowhere; then it is found on AMENT_PREFIX_PATH, as ROS does.
     """
     own = Path(__file__).parent / "msg"
     prefixes = [one for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
@@ -226,17 +208,11 @@ def stamp_rows(stamp_ns: NDArray[np.int64]) -> Rows:
 
 
 def decode(data: bytes, message_type: str, places: dict[str, list[int]] | None = None) -> Any:
-    """Read a message.
+    """Read a message of a type such as nav_msgs/msg/Odometry, with its encapsulation header.
 
-    Args:
-        data: The serialized message with its encapsulation header.
-        message_type: Its type, such as nav_msgs/msg/Odometry.
-        places: Filled with the offsets of each field by its path, such as "robots.x"; those of strings and
-            sequences are of their length.
-
-    Returns:
-        An object with the fields as attributes: numbers, texts, arrays of numbers, messages. A sequence of
-        messages of fixed size is a structured array, see `row_dtype`; any other one is a list.
+    `places` gets the offsets of each field by its path, such as "robots.x"; those of strings and sequences
+    are of their length. The fields are attributes of the result: numbers, texts, arrays of numbers, messages.
+    A sequence of messages of fixed size is a structured array, see `row_dtype`; any other one is a list.
 
     Raises:
         CdrError: The bytes are not one whole message.
@@ -282,11 +258,9 @@ def _columns(message_type: str) -> tuple[tuple[str, str, int], ...] | None:
 def row_dtype(message_type: str, start: int | None = None, order: str = "<") -> np.dtype[np.void]:
     """The bytes of one message of fixed size in a sequence.
 
-    Args:
-        message_type: Its type. A field of a message inside is named by its path; a message inside whose
-            numbers are all of one type, such as a Point, is one field.
-        start: Where it starts, in bytes after a multiple of 8; None: as all but the first of a sequence do.
-        order: "<" or ">".
+    A field of a message inside is named by its path; a message inside whose numbers are all of one type, such
+    as a Point, is one field. It starts `start` bytes after a multiple of 8; None: as all but the first of a
+    sequence do. `order` is "<" or ">".
     """
     columns = _columns(message_type) or ()
     if start is None:
@@ -350,13 +324,11 @@ class _CdrReader:
     def __init__(self, data: bytes, places: dict[str, list[int]] | None) -> None:
         order = _ORDERS.get(bytes(data[:2]))
         if order is None or len(data) < ENCAPSULATION:
-            raise CdrError(
-                f"encapsulation {bytes(data[:ENCAPSULATION]).hex() or 'missing'} is not plain CDR."
-            )
+            found = bytes(data[:ENCAPSULATION]).hex() or "missing"
+            raise CdrError(f"encapsulation {found} is not plain CDR.")
         self._data, self._order, self._offset, self._places = data, order, ENCAPSULATION, places
 
     def message(self, message_type: str, path: str = "") -> Any:
-        """The fields of a message."""
         letters = _numbers(message_type) if self._places is None else ""
         if letters:  # several times faster than one after the other
             numbers = _struct(self._order + letters)
@@ -406,8 +378,7 @@ class _CdrReader:
         rows = np.zeros(count, row_dtype(message_type))
         for part in (rows[:1], rows[1:]):
             dtype = row_dtype(message_type, (self._offset - ENCAPSULATION) % 8, self._order)
-            begin = self._take(len(part) * dtype.itemsize, 1)
-            stored = np.frombuffer(self._data, dtype, len(part), begin)
+            stored = np.frombuffer(self._data, dtype, len(part), self._take(len(part) * dtype.itemsize, 1))
             for name in dtype.names or ():
                 part[name] = stored[name]
         return rows
@@ -428,7 +399,6 @@ class _CdrWriter:
         self.data = bytearray(_LITTLE_ENDIAN)
 
     def message(self, message: object, message_type: str) -> None:
-        """Add a message."""
         if message_type == TIME and isinstance(message, int | np.integer):
             message = dict(zip(("sec", "nanosec"), divmod(int(message), SECOND_NS), strict=True))
         values = message if isinstance(message, Mapping) else vars(message)

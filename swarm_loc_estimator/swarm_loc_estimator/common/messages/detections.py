@@ -10,28 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import (
-    ANONYMOUS_DETECTION,
-    ANONYMOUS_DETECTIONS,
-    BRIGHTNESS,
-    DETECTION,
-    DETECTIONS,
-    ROBOT_IDENTITIES,
-    SECOND_NS,
-    SWARM_DETECTIONS,
-    SWARM_FIXES,
-    SWARM_ODOMETRY,
-    CdrError,
-    Rows,
-    decode,
-    encode,
-    nanoseconds,
-    renamed,
-    row_dtype,
-)
+from swarm_loc_estimator.common.messages import cdr
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode, encode
 
-DETECTION_DTYPE = renamed(
-    row_dtype(DETECTION),
+DETECTION_DTYPE = cdr.renamed(
+    cdr.row_dtype(cdr.DETECTION),
     id=(),
     family=(),
     content=(),
@@ -44,15 +27,12 @@ DETECTION_DTYPE = renamed(
     alternative_orientation=(4,),
     alternative_ratio=(),
 )
-"""One swarm_loc_msgs/MarkerDetection as it lies in little-endian CDR; quaternions are x, y, z, w.
-
-It begins 4 bytes after a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
-"""
+"""A MarkerDetection in little-endian CDR, 4 bytes after a multiple of 8, else see `DETECTION_GAP`."""
 DETECTION_GAP = DETECTION_DTYPE.fields["corners_px"][1]  # type: ignore[index]  # it has fields
 """A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""
 
-ANONYMOUS_DTYPE = renamed(
-    row_dtype(ANONYMOUS_DETECTION), x=(), y=(), theta=(), covariance=(3, 3), u_px=(), v_px=()
+ANONYMOUS_DTYPE = cdr.renamed(
+    cdr.row_dtype(cdr.ANONYMOUS_DETECTION), x=(), y=(), theta=(), covariance=(3, 3), u_px=(), v_px=()
 )
 """A swarm_loc_msgs/AnonymousDetection as it lies in little-endian CDR, at a multiple of 8 bytes."""
 
@@ -62,7 +42,7 @@ class DetectionArrayMessage(NamedTuple):
 
     stamp_ns: int
     frame_id: str
-    detections: Rows
+    detections: cdr.Rows
 
 
 class SharedMessage(NamedTuple):
@@ -77,28 +57,21 @@ class SharedMessage(NamedTuple):
     columns: tuple[NDArray[Any], ...]  # (n, k) numbers of each, or (n,) detections
 
 
-def decode_detections(data: bytes, message_type: str = DETECTIONS) -> DetectionArrayMessage:
-    """Read a swarm_loc_msgs/MarkerDetectionArray, or AnonymousDetectionArray.
-
-    Returns:
-        Stamp, frame and a new array of `DETECTION_DTYPE` or `ANONYMOUS_DTYPE`.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+def decode_detections(data: bytes, message_type: str = cdr.DETECTIONS) -> DetectionArrayMessage:
+    """Read a MarkerDetectionArray, or AnonymousDetectionArray; raises CdrError unless it is a whole one."""
     message = decode(data, message_type)
-    rows = message.detections.view(DETECTION_DTYPE if message_type == DETECTIONS else ANONYMOUS_DTYPE)
-    return DetectionArrayMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
+    rows = message.detections.view(DETECTION_DTYPE if message_type == cdr.DETECTIONS else ANONYMOUS_DTYPE)
+    return DetectionArrayMessage(cdr.nanoseconds(message.header.stamp), message.header.frame_id, rows)
 
 
-def encode_detections(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
+def encode_detections(frame_id: str, stamp_ns: int, detections: cdr.Rows) -> bytes:
     """Serialize one such message from (n,) detections, whose dtype decides of which type."""
     header = {"stamp": stamp_ns, "frame_id": frame_id}
-    message_type = ANONYMOUS_DETECTIONS if detections.dtype == ANONYMOUS_DTYPE else DETECTIONS
+    message_type = cdr.ANONYMOUS_DETECTIONS if detections.dtype == ANONYMOUS_DTYPE else cdr.DETECTIONS
     return encode({"header": header, "detections": detections}, message_type)
 
 
-def blank_detections(ids: ArrayLike, content: int) -> Rows:
+def blank_detections(ids: ArrayLike, content: int) -> cdr.Rows:
     """Detections (n,) of markers by ids (n,), at the origin, without a covariance."""
     rows = np.zeros(np.shape(ids), DETECTION_DTYPE)
     rows["id"], rows["content"] = ids, content
@@ -111,14 +84,11 @@ def blank_detections(ids: ArrayLike, content: int) -> Rows:
 def encode_identities(
     frame_id: str, stamp_ns: int, names: Sequence[str], place: IntArray, probability: FloatArray
 ) -> bytes:
-    """Serialize one swarm_loc_msgs/RobotIdentities of N robots in an aerial image.
-
-    `place` (N,) is which detection each is, -1 for not known, and `probability` (N,) that of it.
-    """
+    """A RobotIdentities: which detection each of N robots is (N,), -1: not known, and how probably (N,)."""
     columns = zip(names, place.tolist(), probability.tolist(), strict=True)
     identities = [{"name": name, "detection": which, "probability": sure} for name, which, sure in columns]
     header = {"stamp": stamp_ns, "frame_id": frame_id}
-    return encode({"header": header, "identities": identities}, ROBOT_IDENTITIES)
+    return encode({"header": header, "identities": identities}, cdr.ROBOT_IDENTITIES)
 
 
 def encode_brightness(
@@ -129,15 +99,11 @@ def encode_brightness(
     power: int = 0,
     saturation: int = 0,
 ) -> bytes:
-    """Serialize one swarm_loc_msgs/BrightnessMatrix.
+    """Serialize one swarm_loc_msgs/BrightnessMatrix of a receiver, whose base_link is `frame_id`.
 
-    Args:
-        frame_id: base_link of the receiver.
-        stamp_ns: Middle of the exchange.
-        pair: Ids of receiver and transmitter.
-        readings: (n, n) [count], [sensor, emitter].
-        power: Index of the power mode.
-        saturation: The reading at and above which a sensor is saturated [count]; 0: not known.
+    `stamp_ns` is the middle of the exchange, `pair` the ids of receiver and transmitter, `readings` (n, n)
+    [count] by sensor and emitter, `power` the index of the power mode; from `saturation` [count] on a sensor
+    is saturated, 0: not known.
     """
     message = {
         "header": {"stamp": stamp_ns, "frame_id": frame_id},
@@ -148,7 +114,7 @@ def encode_brightness(
         "power": power,
         "saturation": saturation,
     }
-    return encode(message, BRIGHTNESS)
+    return encode(message, cdr.BRIGHTNESS)
 
 
 def swarm_key(names: Iterable[str]) -> int:
@@ -157,14 +123,12 @@ def swarm_key(names: Iterable[str]) -> int:
 
 
 def decode_shared_numbers(data: bytes, widths: tuple[int, ...]) -> SharedMessage:
-    """Read a swarm_loc_msgs/SwarmOdometry or SwarmFixes.
-
-    `widths` are the numbers that a reading has in each column.
+    """Read a SwarmOdometry or SwarmFixes, with `widths` numbers of a reading in each column.
 
     Raises:
         CdrError: The bytes are not one whole message, or its columns differ in length.
     """
-    message = decode(data, SWARM_ODOMETRY if len(widths) == 1 else SWARM_FIXES)
+    message = decode(data, cdr.SWARM_ODOMETRY if len(widths) == 1 else cdr.SWARM_FIXES)
     columns = [message.pose] if len(widths) == 1 else [message.pose, message.covariance]
     for column, width in zip(columns, widths, strict=True):
         if column.size != width * message.robot.size:
@@ -173,12 +137,8 @@ def decode_shared_numbers(data: bytes, widths: tuple[int, ...]) -> SharedMessage
 
 
 def decode_shared_detections(data: bytes) -> SharedMessage:
-    """Read a swarm_loc_msgs/SwarmDetections.
-
-    Raises:
-        CdrError: The bytes are not one whole message, or its columns differ in length.
-    """
-    message = decode(data, SWARM_DETECTIONS)
+    """Read a SwarmDetections; raises CdrError unless it is whole, with columns of one length."""
+    message = decode(data, cdr.SWARM_DETECTIONS)
     if message.detections.size != message.robot.size:
         raise CdrError(f"a column has {message.detections.size} detections in place of {message.robot.size}.")
     return _shared(message, message.detections.view(DETECTION_DTYPE))
@@ -188,8 +148,8 @@ def _shared(message: Any, *columns: NDArray[Any]) -> SharedMessage:
     stamps = message.stamp
     if stamps.size != message.robot.size:
         raise CdrError("there are not as many stamps as robots.")
-    reading_ns = stamps["sec"].astype(np.int64) * SECOND_NS + stamps["nanosec"]
-    reading_ns[stamps["nanosec"] >= SECOND_NS] = -1
+    reading_ns = stamps["sec"].astype(np.int64) * cdr.SECOND_NS + stamps["nanosec"]
+    reading_ns[stamps["nanosec"] >= cdr.SECOND_NS] = -1
     robot = message.robot.astype(np.int64)
-    stamp_ns, frame_id = nanoseconds(message.header.stamp), message.header.frame_id
+    stamp_ns, frame_id = cdr.nanoseconds(message.header.stamp), message.header.frame_id
     return SharedMessage(stamp_ns, frame_id, message.swarm, robot, reading_ns, columns)

@@ -44,10 +44,7 @@ def decode_events(
 ) -> Events:
     """The events of a packet in anything that has a buffer; `size` is width and height of the sensor [px].
 
-    Only the encoding `mono` is known.
-
-    Raises:
-        EventError: Another encoding, a cut event, one outside of the sensor, or times that step back.
+    Raises EventError: another encoding than `mono`, a cut event, one outside of the sensor, decreasing times.
     """
     if encoding != ENCODING:
         raise EventError(f"encoding '{encoding[:40]}' is not {ENCODING}")

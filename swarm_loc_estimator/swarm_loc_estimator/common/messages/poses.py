@@ -1,6 +1,4 @@
-"""Poses of the plane as ROS messages: nav_msgs/Odometry and the stamped poses of geometry_msgs.
-
-Messages that the estimator publishes, swarm/poses and transforms, without a loop over robots.
+"""Poses of the plane as ROS messages: nav_msgs/Odometry, stamped poses, swarm/poses and transforms.
 
 Names hardly ever change from one message to the next: a message is laid out once, then only its numbers are
 read or replaced. To read or build message objects would cost 20 us and more per robot and message.
@@ -18,28 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.messages.cdr import (
-    ENCAPSULATION,
-    ODOMETRY,
-    POSE_STAMPED,
-    POSE_WITH_COVARIANCE,
-    SECOND_NS,
-    SWARM_POSES,
-    TRANSFORMS,
-    CdrError,
-    decode,
-    encode,
-    nanoseconds,
-    stamp_rows,
-)
+from swarm_loc_estimator.common.messages import cdr
+from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, CdrError, decode, encode, nanoseconds
 
 POSE_DOUBLES = 7  # Numbers of a geometry_msgs/Pose: position and quaternion
 PLANE = np.ix_((0, 1, 5), (0, 1, 5))  # Where x, y and yaw stand in a 6x6 covariance
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
 STAMP_SIZE = 8
-_COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
-"""Where a planar covariance stands after a pose."""
+_COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()  # Of the plane, after a pose
 
 
 class PoseMessage(NamedTuple):
@@ -68,7 +53,7 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
 
 def decode_odometry(data: bytes) -> PoseMessage:
     """Read a nav_msgs/Odometry; raises CdrError unless the bytes are a whole one."""
-    message = decode(data, ODOMETRY)
+    message = decode(data, cdr.ODOMETRY)
     twist = message.twist.twist
     known = (twist.linear.x, twist.linear.y, twist.angular.z), message.child_frame_id
     return _with_covariance(message, *known)
@@ -76,21 +61,20 @@ def decode_odometry(data: bytes) -> PoseMessage:
 
 def decode_pose_stamped(data: bytes) -> PoseMessage:
     """Read a geometry_msgs/PoseStamped; raises CdrError unless the bytes are a whole one."""
-    message = decode(data, POSE_STAMPED)
+    message = decode(data, cdr.POSE_STAMPED)
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, planar_pose(message.pose))
 
 
 def decode_fix(data: bytes) -> PoseMessage:
     """Read a geometry_msgs/PoseWithCovarianceStamped; raises CdrError unless the bytes are a whole one."""
-    return _with_covariance(decode(data, POSE_WITH_COVARIANCE))
+    return _with_covariance(decode(data, cdr.POSE_WITH_COVARIANCE))
 
 
 def _with_covariance(message: Any, *known: Any) -> PoseMessage:
     """What a message says whose pose has a covariance, and what else is known of it."""
     header, covariance = message.header, message.pose.covariance.reshape(6, 6)[PLANE]
-    return PoseMessage(
-        nanoseconds(header.stamp), header.frame_id, planar_pose(message.pose.pose), covariance, *known
-    )
+    pose = planar_pose(message.pose.pose)
+    return PoseMessage(nanoseconds(header.stamp), header.frame_id, pose, covariance, *known)
 
 
 def position_and_quaternion(poses: FloatArray) -> FloatArray:
@@ -116,19 +100,10 @@ def encode_odometry(
     covariance: FloatArray = UNKNOWN_COVARIANCE,
     twist_covariance: FloatArray = UNKNOWN_COVARIANCE,
 ) -> list[bytes]:
-    """Serialize nav_msgs/Odometry of one robot.
+    """Serialize N nav_msgs/Odometry of one robot, with frames `<robot>/odom` and `<robot>/base_link`.
 
-    Args:
-        frame_id: Frame of the pose, `<robot>/odom`.
-        child_frame_id: Frame of the twist, `<robot>/base_link`.
-        stamp_ns: (N,) acquisition times.
-        pose: (N, 3) x [m], y [m], yaw [rad].
-        twist: (N, 3) vx [m/s], vy [m/s], yaw rate [rad/s].
-        covariance: (6, 6) of the pose, the same in all.
-        twist_covariance: (6, 6) of the twist, the same in all.
-
-    Returns:
-        N messages.
+    `stamp_ns` (N,) are acquisition times, `pose` (N, 3) x [m], y [m], yaw [rad], and `twist` (N, 3) vx [m/s],
+    vy [m/s], yaw rate [rad/s]. The covariances (6, 6) of both are the same in all.
     """
     numbers = np.zeros((len(stamp_ns), POSE_DOUBLES + 36 + 6 + 36))
     numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
@@ -136,25 +111,22 @@ def encode_odometry(
     numbers[:, [43, 44, 48]] = twist
     numbers[:, 49:] = twist_covariance.reshape(36)
     model = {"header": {"frame_id": frame_id}, "child_frame_id": child_frame_id}
-    return _copies(encode(model, ODOMETRY), stamp_ns, numbers)
+    return _copies(encode(model, cdr.ODOMETRY), stamp_ns, numbers)
 
 
 def encode_pose_stamped(frame_id: str, stamp_ns: IntArray, pose: FloatArray) -> list[bytes]:
     """Serialize geometry_msgs/PoseStamped; arguments as for `encode_odometry`."""
-    model = encode({"header": {"frame_id": frame_id}}, POSE_STAMPED)
+    model = encode({"header": {"frame_id": frame_id}}, cdr.POSE_STAMPED)
     return _copies(model, stamp_ns, position_and_quaternion(pose))
 
 
 def encode_poses(frame_id: str, stamp_ns: IntArray, pose: FloatArray, covariance: FloatArray) -> list[bytes]:
-    """Serialize N geometry_msgs/PoseWithCovarianceStamped of the plane.
-
-    They are of stamps (N,), poses (N, 3) x [m], y [m], yaw [rad] and their covariances (N, 3, 3).
-    """
+    """N PoseWithCovarianceStamped of poses (N, 3) x [m], y [m], yaw [rad] and covariances (N, 3, 3)."""
     numbers = np.zeros((len(pose), POSE_DOUBLES + 36))
     numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
     numbers[:, POSE_DOUBLES:] = planar_covariance(0.0, 0.0, 0.0).reshape(36)
     numbers[:, _COVARIANCE] = covariance.reshape(-1, 9)
-    return _copies(encode({"header": {"frame_id": frame_id}}, POSE_WITH_COVARIANCE), stamp_ns, numbers)
+    return _copies(encode({"header": {"frame_id": frame_id}}, cdr.POSE_WITH_COVARIANCE), stamp_ns, numbers)
 
 
 def encode_fix(frame_id: str, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> bytes:
@@ -165,7 +137,7 @@ def encode_fix(frame_id: str, stamp_ns: int, pose: ArrayLike, covariance: ArrayL
 
 def stamp_bytes(stamp_ns: IntArray) -> NDArray[np.uint8]:
     """(n, 8) bytes of stamps (n,), as builtin_interfaces/Time has them."""
-    return stamp_rows(stamp_ns).view(np.uint8).reshape(-1, STAMP_SIZE)
+    return cdr.stamp_rows(stamp_ns).view(np.uint8).reshape(-1, STAMP_SIZE)
 
 
 def _copies(model: bytes, stamp_ns: IntArray, numbers: FloatArray) -> list[bytes]:
@@ -204,7 +176,7 @@ class _Layout:
 
     def __init__(self, data: bytes) -> None:
         places: dict[str, list[int]] = {}
-        message = decode(data, SWARM_POSES, places)
+        message = decode(data, cdr.SWARM_POSES, places)
         self.frame_id: str = message.header.frame_id  # Frame of the poses
         self.names = tuple(robot.name for robot in message.robots)  # N robots
         # (N, 104) indices of the bytes of each robot's numbers
@@ -221,7 +193,7 @@ class SwarmPosesReader:
     """Reads serialized SwarmPoses."""
 
     def __init__(self) -> None:
-        self._layout = _Layout(encode({}, SWARM_POSES))
+        self._layout = _Layout(encode({}, cdr.SWARM_POSES))
         self._length = -1
 
     def read(self, data: bytes) -> EstimateMessage:
@@ -235,7 +207,7 @@ class SwarmPosesReader:
         seconds, rest_ns = struct.unpack_from("<iI", data, ENCAPSULATION)
         numbers = raw[layout.numbers].view("<f8").reshape(-1, _DOUBLES)
         return EstimateMessage(
-            seconds * SECOND_NS + rest_ns,
+            seconds * cdr.SECOND_NS + rest_ns,
             layout.frame_id,
             layout.names,
             numbers[:, :3],
@@ -251,7 +223,7 @@ class SwarmPosesEncoder:
 
     def __init__(self, names: list[str], frame_id: str) -> None:
         robots = [{"name": name} for name in names]
-        message = encode({"header": {"frame_id": frame_id}, "robots": robots}, SWARM_POSES)
+        message = encode({"header": {"frame_id": frame_id}, "robots": robots}, cdr.SWARM_POSES)
         self._layout = _Layout(message)
         self._message = np.frombuffer(bytearray(message), dtype=np.uint8)
 
@@ -293,9 +265,9 @@ class TransformsEncoder:
     def _lay_out(self, included: BoolArray) -> None:
         children = [self._children[index] for index in np.flatnonzero(included)]
         transforms = [{"header": self._header, "child_frame_id": child} for child in children]
-        message = encode({"transforms": transforms}, TRANSFORMS)
+        message = encode({"transforms": transforms}, cdr.TRANSFORMS)
         places: dict[str, list[int]] = {}
-        decode(message, TRANSFORMS, places)
+        decode(message, cdr.TRANSFORMS, places)
         self._included = included.copy()
         self._message = np.frombuffer(bytearray(message), dtype=np.uint8)
         self._stamps = _bytes_from(places.get("transforms.header.stamp.sec", []), STAMP_SIZE)

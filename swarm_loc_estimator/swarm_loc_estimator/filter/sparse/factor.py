@@ -86,15 +86,23 @@ def _begins(sizes: IntArray) -> IntArray:
 
 
 @cached_njit
+def _front(factor: Factor, f: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """The pivots (j,) and the border (b,) of front f, its A (3 b, 3 j) and D (3 j, 3 j)."""
+    pattern = factor.pattern
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    size = 3 * pivots.size
+    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(3 * border.size, size)
+    spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+    return pivots, border, gain, spread
+
+
+@cached_njit
 def write_fronts(factor: Factor, covariance: FloatArray) -> None:
-    """Write the covariances within all fronts, from the last front to the first.
+    """Write the covariances (n, n, 3, 3) within all fronts of n bodies, from the last front to the first.
 
-    Takahashi et al., "Formation of a sparse bus impedance matrix and its application to short circuit study"
-    (1973), for fronts.
-
-    Args:
-        factor: Factor of n bodies, none of them appended.
-        covariance: (n, n, 3, 3) written; other entries do not change.
+    No body is appended; other entries do not change. Takahashi et al., "Formation of a sparse bus impedance
+    matrix and its application to short circuit study" (1973), for fronts.
     """
     for f in range(factor.pattern.pivot_begin.size - 2, -1, -1):
         _write_front(factor, f, covariance)
@@ -103,46 +111,38 @@ def write_fronts(factor: Factor, covariance: FloatArray) -> None:
 @cached_njit
 def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
     """Write the covariances of the pivots of front f, from those of its border."""
-    pattern = factor.pattern
-    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-    width, size = 3 * border.size, 3 * pivots.size
-    own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
-    if width:
-        gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
+    pivots, border, gain, own = _front(factor, f)
+    if border.size:
         across = np.dot(gathered(covariance, border, border), gain)
         own = own + np.dot(gain.T, across)
         _scatter(covariance, border, pivots, across)
-    _scatter_own(covariance, pivots, own)
+    for r in range(pivots.size):  # symmetric to the last bit
+        for c in range(pivots.size):
+            for i in range(3):
+                for j in range(3):
+                    a, b = 3 * r + i, 3 * c + j
+                    covariance[pivots[r], pivots[c], i, j] = 0.5 * (own[a, b] + own[b, a])
 
 
 @cached_njit
 def write_rows(
     factor: Factor, derived: int, rows: IntArray, rows_begin: IntArray, covariance: FloatArray
 ) -> None:
-    """Write the covariances of wanted rows and of appended bodies, from those within other fronts.
+    """Write the covariances (n, n, 3, 3) of wanted rows and appended bodies, from those within other fronts.
 
-    Args:
-        factor: Factor of n bodies.
-        derived: Number of first fronts of appended bodies; pairs of their borders may be in no front.
-        rows: From `symbolic.wanted_rows`.
-        rows_begin: (F + 1,) start of each front's rows.
-        covariance: (n, n, 3, 3) written; other entries do not change.
+    The first fronts, `derived` in number, are of appended bodies; pairs of their borders may be in no front.
+    For `rows` and their start in each front (F + 1,) see `wanted_rows`. Other entries do not change.
     """
-    pattern = factor.pattern
-    for f in range(pattern.pivot_begin.size - 2, -1, -1):
+    for f in range(factor.pattern.pivot_begin.size - 2, -1, -1):
         if f < derived:
             _write_front(factor, f, covariance)
         wanted = rows[rows_begin[f] : rows_begin[f + 1]]
         if not wanted.size:
             continue
-        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        pivots, border, gain, _ = _front(factor, f)
         across = np.zeros((3 * wanted.size, 3 * pivots.size))
         if border.size:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
-            gain_of = gain.reshape(3 * border.size, 3 * pivots.size)
-            np.dot(gathered(covariance, wanted, border), gain_of, across)
+            np.dot(gathered(covariance, wanted, border), gain, across)
         _scatter(covariance, wanted, pivots, across)
 
 
@@ -159,35 +159,27 @@ def solve(factor: Factor, right: FloatArray) -> None:
 @cached_njit
 def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
     """Forward substitution of front f: add the contribution of its pivots to its border."""
-    pattern, columns = factor.pattern, right.shape[1]
-    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-    rows, size = 3 * border.size, 3 * pivots.size
-    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
+    pivots, border, gain, _ = _front(factor, f)
+    rows = 3 * border.size
     if pivots.size <= _FEW:
         for r in range(rows):
             out = right[3 * border[r // 3] + r % 3]
-            for p in range(0, size, 3):
+            for p in range(0, 3 * pivots.size, 3):
                 of_pivot = right[3 * pivots[p // 3] : 3 * pivots[p // 3] + 3]
                 add_rows(of_pivot, gain[r, p], gain[r, p + 1], gain[r, p + 2], out)
     elif border.size:
         added = np.dot(gain, _rows_of(right, pivots))
         for r in range(rows):
             row = 3 * border[r // 3] + r % 3
-            for c in range(columns):
+            for c in range(right.shape[1]):
                 right[row, c] += added[r, c]
 
 
 @cached_njit
 def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
     """Back substitution of front f: solve for its pivots, given its border."""
-    pattern = factor.pattern
-    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-    rows, size = 3 * border.size, 3 * pivots.size
-    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
-    spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
-    own = _rows_of(right, pivots)
+    pivots, border, gain, spread = _front(factor, f)
+    rows, size, own = 3 * border.size, 3 * pivots.size, _rows_of(right, pivots)
     if pivots.size <= _FEW:
         for p in range(size):
             out = right[3 * pivots[p // 3] + p % 3]
@@ -248,17 +240,6 @@ def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: 
                     covariance[rows[r], columns[c], i, j] = values[3 * r + i, 3 * c + j]
 
 
-@cached_njit
-def _scatter_own(covariance: FloatArray, bodies: IntArray, values: FloatArray) -> None:
-    """Write covariances (3 k, 3 k) among bodies (k,), symmetric to the last bit."""
-    for r in range(bodies.size):
-        for c in range(bodies.size):
-            for i in range(3):
-                for j in range(3):
-                    a, b = 3 * r + i, 3 * c + j
-                    covariance[bodies[r], bodies[c], i, j] = 0.5 * (values[a, b] + values[b, a])
-
-
 _LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
 """Relative increases of the variances, tried in turn where rounding has made a covariance indefinite."""
 _PANEL = 24  # Rows solved at once
@@ -298,14 +279,19 @@ def _eliminate(
     local = np.zeros(pattern.front.size, dtype=np.int64)
     for f in range(fronts):
         # the bodies of the front, its border first
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        bodies = np.concatenate((border, pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]))
-        split, size = 3 * border.size, 3 * (bodies.size - border.size)
+        pivots, border, gain, spread = _front(factor, f)
+        bodies = np.concatenate((border, pivots))
+        split, size = 3 * border.size, 3 * pivots.size
         for k in range(bodies.size):
             local[bodies[k]] = k
         # information: p(x_J | x_B) of the prior, measurements, and what earlier fronts leave of theirs
         places = prior.place[bodies]
-        information = _conditional(gathered(prior.covariance, places, places), size, looser)
+        covariance = gathered(prior.covariance, places, places)
+        for k in range(split + size):
+            covariance[k, k] *= 1.0 + looser
+        lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
+        columns = _last_columns(lower, size)
+        information = np.dot(columns, columns.T)
         _add_blocks(information, local, measured, order[begin[f] : begin[f + 1]])
         below = child[f]
         while below >= 0:
@@ -314,28 +300,15 @@ def _eliminate(
             updates[below] = np.empty((0, 0))
             below = sibling[below]
         # D and A of the pivots, and what they leave to the front of the border's first body
-        spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
         own: FloatArray = np.linalg.cholesky(np.ascontiguousarray(information[split:, split:]))
         root = _last_columns(own, size)
         np.dot(root, root.T, spread)
         if split:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(split, size)
             across = -information[:split, split:]
             np.dot(across, spread, gain)
             updates[f] = information[:split, :split] - np.dot(gain, across.T)
             parent = pattern.front[border].min()
             sibling[f], child[parent] = child[parent], f
-
-
-@cached_njit
-def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
-    """Information (d, d) of p(x_J | x_B) from a covariance (d, d) whose last `size` rows are the pivots."""
-    for k in range(covariance.shape[0]):
-        covariance[k, k] *= 1.0 + looser
-    lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
-    columns = _last_columns(lower, size)
-    information: FloatArray = np.dot(columns, columns.T)
-    return information
 
 
 @cached_njit

@@ -234,12 +234,9 @@ def wanted_rows(
 ) -> tuple[IntArray, IntArray]:
     """Covariances of an old factor, outside its pattern, that a new pattern needs.
 
-    Args:
-        old: Pattern of the old factor, with its own numbers of bodies.
-        new: The new pattern.
-        place: (n,) numbers of the new pattern's bodies in the old one.
-        derived: Number of first fronts with borders whose pairs may be in no front.
-        beside: (n,) body whose pairs are needed together with those of another one; -1: none.
+    `place` (n,) are the numbers of the new pattern's bodies in the old one, `derived` the number of first
+    fronts with borders whose pairs may be in no front, and `beside` (n,) the body whose pairs are needed
+    together with those of another one; -1: none.
 
     Returns:
         Bodies, front by front of the old pattern, whose covariances with its pivots are needed, and the start
@@ -263,26 +260,17 @@ class _Sequence(NamedTuple):
 def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
     """Mark all pairs of the new pattern and of `beside` at the front of the earlier body."""
     for f in range(new.pivot_begin.size - 1):
+        border = new.border[new.border_begin[f] : new.border_begin[f + 1]]
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
             a = new.pivot[k]
             if beside[a] >= 0:
                 _want(old, place[a], place[beside[a]], wanted)
-            for q in range(k + 1, new.pivot_begin[f + 1]):
-                _want_with(old, a, new.pivot[q], place, beside, wanted)
-            for q in range(new.border_begin[f], new.border_begin[f + 1]):
-                _want_with(old, a, new.border[q], place, beside, wanted)
-
-
-@cached_njit
-def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Mark a pair of bodies, and the pairs with those of `beside`."""
-    _want(old, place[a], place[b], wanted)
-    if beside[a] >= 0:
-        _want(old, place[beside[a]], place[b], wanted)
-        if beside[b] >= 0:
-            _want(old, place[beside[a]], place[beside[b]], wanted)
-    if beside[b] >= 0:
-        _want(old, place[a], place[beside[b]], wanted)
+            for others in (new.pivot[k + 1 : new.pivot_begin[f + 1]], border):
+                for b in others:
+                    for one in (a, beside[a]):  # and those beside both
+                        for other in (b, beside[b]):
+                            if one >= 0 and other >= 0:
+                                _want(old, place[one], place[other], wanted)
 
 
 @cached_njit
@@ -431,9 +419,9 @@ class Situation(NamedTuple):
     # (k, 2) bodies of which one has measured the other recently, and pairs that follow from blocks
     pairs: IntArray
 
-    def near(self) -> IntArray:
-        """Pairs (k, 2) of near bodies."""
-        return self.bodies[near_pairs(self.places[self.bodies])]
+    def near(self) -> NearPairs:
+        """Pairs of near bodies."""
+        return NearPairs(self.bodies[near_pairs(self.places[self.bodies])], 1)
 
     def pattern(self, order: Order, near: IntArray) -> Pattern:
         """The pattern that contains all pairs."""
@@ -460,10 +448,6 @@ class NearPairs(NamedTuple):
     pairs: IntArray
     updates: int
 
-    def used_again(self) -> NearPairs:
-        """The same pairs after one more update."""
-        return self._replace(updates=self.updates + 1)
-
 
 @dataclass(frozen=True, eq=False)
 class Ordering:
@@ -480,8 +464,8 @@ class Ordering:
     def next_near(self) -> NearPairs:
         """The near pairs of the next order."""
         if self.near.updates < _NEAR_AGAIN:
-            return self.near.used_again()
-        return NearPairs(self.situation.near(), 1)
+            return NearPairs(self.near.pairs, self.near.updates + 1)
+        return self.situation.near()
 
     @cached_property
     def next_order(self) -> Order:
@@ -492,14 +476,14 @@ class Ordering:
 def ordered(situation: Situation, before: Ordering | None) -> Ordering:
     """The ordering of an update; `before` is that of the previous update, None at first."""
     if before is None or not situation.has_same(before.situation):
-        near = NearPairs(situation.near(), 1)
+        near = situation.near()
         return _with_new_order(situation, situation.order(near.pairs), near)
     if before.updates >= _ORDERED_AGAIN:
         return _with_new_order(situation, before.next_order, before.next_near)
     pattern = situation.pattern(before.order, before.near.pairs)
     if pattern.width > _GROWN * before.width:
         return _with_new_order(situation, situation.order(before.next_near.pairs), before.next_near)
-    near = before.near.used_again()
+    near = NearPairs(before.near.pairs, before.near.updates + 1)
     return Ordering(situation, pattern, before.order, before.updates + 1, before.width, near)
 
 

@@ -74,15 +74,10 @@ def centres(covariances: FloatArray) -> FloatArray:
 def information_of(
     columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray, places: FloatArray
 ) -> Information:
-    """Information of measurements about bodies, each about its reference point.
+    """Information of measurements (m,) about bodies, each about its reference point (n, 2).
 
-    Args:
-        columns: (m, c) filter columns that each depends on: those of two bodies, then some of one block of
-            parameters.
-        jacobian: (m, 3, c), zero where there is no body.
-        innovation: (m, 3) measured minus predicted.
-        noise: (m, 3, 3) covariances.
-        places: (n, 2) reference points.
+    The columns (m, c) that each depends on are those of two bodies, then some of one block of parameters; the
+    Jacobian (m, 3, c) is zero where there is no body.
     """
     measurements, count = columns.shape[0], 0
     first, second = np.empty(6 * measurements, dtype=np.int64), np.empty(6 * measurements, dtype=np.int64)
@@ -91,22 +86,33 @@ def information_of(
     for k in range(measurements):
         factor = cholesky3(noise[k])
         for side in range(2):
-            bodies[side] = columns[k, 3 * side] // 3
-            _about_place(jacobian[k, :, 3 * side : 3 * side + 3], places[bodies[side]], by[side])
-        bodies[2] = _by_parameters(columns[k], jacobian[k], by[2])
+            # by eta instead of xi, with the components as columns
+            bodies[side], own = columns[k, 3 * side] // 3, jacobian[k, :, 3 * side : 3 * side + 3]
+            place = places[bodies[side]]
+            for i in range(3):
+                by[side, 0, i], by[side, 1, i] = own[i, 0], own[i, 1]
+                by[side, 2, i] = own[i, 2] + place[1] * own[i, 0] - place[0] * own[i, 1]
+        bodies[2] = -1  # the block of parameters
+        for c in range(6, columns.shape[1]):
+            if jacobian[k, 0, c] != 0.0 or jacobian[k, 1, c] != 0.0 or jacobian[k, 2, c] != 0.0:
+                if bodies[2] < 0:
+                    by[2] = 0.0
+                bodies[2] = columns[k, c] // 3
+                for i in range(3):
+                    by[2, columns[k, c] % 3, i] = jacobian[k, i, c]
         sides = 3 if bodies[2] >= 0 else 2
         for side in range(sides):
             for a in range(3):
                 solve3(factor, by[side, a], weighted[side, a])
         for side in range(sides):
             body = bodies[side]
-            if not _depends(by[side]):
+            if not by[side].any():
                 continue
             for a in range(3):
                 for i in range(3):
                     gradient[body, a] += weighted[side, a, i] * innovation[k, i]
             for other in range(side + 1):
-                if _depends(by[other]):
+                if by[other].any():
                     first[count], second[count] = body, bodies[other]
                     for a in range(3):
                         for b in range(3):
@@ -120,12 +126,8 @@ def information_of(
 def summed(measured: Information) -> Information:
     """The same information with repeated blocks summed into the first of them."""
     count, bodies = measured.first.size, len(measured.gradient)
-    newest, before, kept = (
-        np.full(bodies, -1),
-        np.empty(count, dtype=np.int64),
-        np.empty(count, dtype=np.int64),
-    )
-    place_of, pairs = np.empty(count, dtype=np.int64), 0
+    newest, pairs = np.full(bodies, -1), 0
+    before, kept, place_of = np.empty((3, count), dtype=np.int64)
     for k in range(count):
         place = newest[measured.first[k]]
         while place >= 0 and measured.second[kept[place]] != measured.second[k]:
@@ -149,38 +151,6 @@ def summed(measured: Information) -> Information:
             for j in range(3):
                 block[place, i, j] += measured.block[k, i, j]
     return Information(first, second, block, measured.gradient)
-
-
-@cached_njit
-def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> None:
-    """Write the columns of a Jacobian with respect to xi (3, 3) as rows with respect to eta."""
-    for i in range(3):
-        out[0, i], out[1, i] = jacobian[i, 0], jacobian[i, 1]
-        out[2, i] = jacobian[i, 2] + place[1] * jacobian[i, 0] - place[0] * jacobian[i, 1]
-
-
-@cached_njit
-def _by_parameters(columns: IntArray, jacobian: FloatArray, out: FloatArray) -> int:
-    """Write the parameter columns of a Jacobian (3, c) as rows of their block; return it, -1: none."""
-    block = -1
-    for c in range(6, columns.size):
-        if jacobian[0, c] != 0.0 or jacobian[1, c] != 0.0 or jacobian[2, c] != 0.0:
-            if block < 0:
-                out[:] = 0.0
-            block = columns[c] // 3
-            for i in range(3):
-                out[columns[c] % 3, i] = jacobian[i, c]
-    return block
-
-
-@cached_njit
-def _depends(rows: FloatArray) -> bool:
-    """Whether any entry of a matrix (3, 3) is not zero."""
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += abs(rows[i, j])
-    return total > 0.0
 
 
 class Groups(NamedTuple):
@@ -231,10 +201,7 @@ def active_blocks(groups: Groups, active: BoolArray) -> Order:
 def block_pairs(groups: Groups, active: BoolArray, measured: IntArray) -> IntArray:
     """Pairs (k, 2) that follow from blocks: among a robot, its blocks and what it has measured.
 
-    Args:
-        groups: Robots and their blocks.
-        active: (n,) active bodies and blocks.
-        measured: (m, 2) observers and what they have measured, all active.
+    `active` (n,) are bodies and blocks, `measured` (m, 2) observers and what they have measured, all active.
     """
     robots = np.arange(len(groups.member))
     has_blocks = np.zeros(active.size, dtype=bool)
@@ -276,28 +243,21 @@ def _cliques(pairs: IntArray, bodies: int) -> IntArray:
 
 @cached_njit
 def move(covariance: FloatArray, pattern: Pattern, place: IntArray, moves: Moves) -> None:
-    """Apply a transition to the covariances of all pairs of a pattern.
+    """Apply a transition to the covariances (n, n, 3, 3) of all pairs of a pattern.
 
-    Args:
-        covariance: (n, n, 3, 3) changed; includes the pairs of the blocks that change a body.
-        pattern: Pairs to change.
-        place: Numbers of the pattern's bodies in `covariance`.
-        moves: The transition.
+    They include the pairs of the blocks that change a body; `place` has the numbers of the pattern's bodies.
     """
     room = np.empty((2, 3, 3))
     # blocks change after the bodies that depend on them: pairs of two such bodies first, then of one, of none
     for moved in (2, 1, 0):
         for f in range(pattern.pivot_begin.size - 1):
+            border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
             for k in range(pattern.pivot_begin[f], pattern.pivot_begin[f + 1]):
                 a = pattern.pivot[k]
-                for q in range(k, pattern.pivot_begin[f + 1]):
-                    b = pattern.pivot[q]
-                    if (moves.beside[a] >= 0) + (moves.beside[b] >= 0) == moved:
-                        _move_pair(covariance, a, b, place, moves, room)
-                for q in range(pattern.border_begin[f], pattern.border_begin[f + 1]):
-                    b = pattern.border[q]
-                    if (moves.beside[a] >= 0) + (moves.beside[b] >= 0) == moved:
-                        _move_pair(covariance, a, b, place, moves, room)
+                for others in (pattern.pivot[k : pattern.pivot_begin[f + 1]], border):
+                    for b in others:
+                        if (moves.beside[a] >= 0) + (moves.beside[b] >= 0) == moved:
+                            _move_pair(covariance, a, b, place, moves, room)
 
 
 @inlined_njit

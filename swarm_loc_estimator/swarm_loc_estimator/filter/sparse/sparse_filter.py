@@ -24,6 +24,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
 from swarm_loc_estimator.common.numerics import invert_factor
 from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.filter.sparse import parameters
 from swarm_loc_estimator.filter.sparse.factor import (
     EMPTY,
     Derived,
@@ -44,38 +45,18 @@ from swarm_loc_estimator.filter.sparse.ordering import (
     spread,
     wanted_rows,
 )
-from swarm_loc_estimator.filter.sparse.parameters import (
-    Groups,
-    Information,
-    Moves,
-    active_blocks,
-    block_pairs,
-    carried,
-    carried_pairs,
-    centres,
-    information_of,
-    move,
-    moved_shares,
-    summed,
-    translation_adjoints,
-)
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 _DRIVEN = slice(3, 3 + DRIVES)
 
 
 class Marginals:
-    """The marginal covariance of each body with its parameters, as predictions change it.
+    """The marginal covariance of each body with its parameters, as predictions change it."""
 
-    Attributes:
-        groups: Which bodies have blocks of parameters.
-        current: (n, w, w) see `JointFilter.marginal`.
-        transition: (robots, 3 + BLOCKS, DRIVES) see `JointFilter.transition`.
-    """
-
-    def __init__(self, groups: Groups) -> None:
-        self.groups = groups
+    def __init__(self, groups: parameters.Groups) -> None:
+        self.groups = groups  # Which bodies have blocks of parameters
         count, width = groups.owner.size, _width(groups)
+        # (n, w, w) and (robots, 3 + BLOCKS, DRIVES), see `JointFilter`
         self.current: FloatArray = np.zeros((count, width, width))
         self.current[:, :3, :3] = np.eye(3)
         self._settled = self.current.copy()
@@ -88,7 +69,7 @@ class Marginals:
         vars(other).update(arrays | {"groups": self.groups})
         return other
 
-    def append_columns(self, groups: Groups) -> None:
+    def append_columns(self, groups: parameters.Groups) -> None:
         """Append bodies or blocks, without error."""
         self.groups, transition = groups, _no_transition(groups)
         transition[: len(self.transition)] = self.transition
@@ -126,15 +107,15 @@ class Marginals:
                 where = slice(3 * row, 3 * row + 3), slice(3 * column, 3 * column + 3)
                 yield where, robots[there], member[there, row], member[there, column]
 
-    def since(self, bodies: IntArray, places: FloatArray) -> tuple[FloatArray, Moves]:
+    def since(self, bodies: IntArray, places: FloatArray) -> tuple[FloatArray, parameters.Moves]:
         """Changes of the errors of bodies (k,) since the newest factor, about reference points (n, 2).
 
         Returns:
             Process noise (k, w, w) of bodies and parameters, and the transition.
         """
         count, before = self.groups.owner.size, self._settled[bodies]
-        adjoint = translation_adjoints(places[bodies])
-        moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
+        adjoint = parameters.translation_adjoints(places[bodies])
+        moves = parameters.Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
         if (bodies < len(self.transition)).any():
             of_robots = np.flatnonzero(bodies < len(self.transition))
             robots, own = bodies[of_robots], np.arange(3, before.shape[1])
@@ -153,38 +134,32 @@ class Marginals:
         return noise, moves
 
 
-def _width(groups: Groups) -> int:
+def _width(groups: parameters.Groups) -> int:
     """Columns of a body with its parameters, up to the last block that any robot has."""
     return 3 * (1 + int(np.flatnonzero((groups.member >= 0).any(axis=0)).max(initial=0)))
 
 
-def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
+def _enlarged(known: FloatArray, groups: parameters.Groups) -> FloatArray:
     """Covariances (n, w, w) with more bodies and blocks, without error."""
     out = np.zeros((groups.owner.size, _width(groups), _width(groups)))
     out[: len(known), : known.shape[1], : known.shape[1]] = known
     return out
 
 
-def _no_transition(groups: Groups) -> FloatArray:
+def _no_transition(groups: parameters.Groups) -> FloatArray:
     """The identity transition; for no robot where there are no parameters."""
     robots = len(groups.member) if _width(groups) > 3 else 0
     return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones((BLOCKS, DRIVES))]), (robots, 1, 1))
 
 
 def derived_by(
-    moves: Moves, robot: int, blocks: IntArray, noise: FloatArray, numbers: IntArray
+    moves: parameters.Moves, robot: int, blocks: IntArray, noise: FloatArray, numbers: IntArray
 ) -> list[Derived]:
-    """The blocks and the pose of one robot after a transition, to be appended.
+    """The blocks and then the pose of one robot after a transition, to be appended.
 
-    Args:
-        moves: The transition.
-        robot: The robot.
-        blocks: (BLOCKS,) its blocks, of which the first one changes its pose; -1: none.
-        noise: (w, w) process noise of the pose and the blocks; diagonal within the first block.
-        numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body; -1: none.
-
-    Returns:
-        The new blocks in their order, then the pose.
+    Of its blocks (BLOCKS,) the first one changes its pose. The process noise (w, w) of pose and blocks is
+    diagonal within it. `numbers` (2 + BLOCKS,) are of the pose and the blocks before, and of the next body. A
+    block or number of -1: none.
     """
     out: list[Derived] = []
     gain, left = moves.gain[robot], moves.left[blocks[0]]
@@ -236,14 +211,10 @@ def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
     return across.reshape(count, 3, size)
 
 
-def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[FloatArray, FloatArray]:
-    """G after measurements, and their correction (n, 3).
-
-    Args:
-        factor: Of y, after the measurements.
-        shares: (n, 3, k) G before them.
-        measured: Information of the measurements.
-    """
+def updated(
+    factor: Factor, shares: FloatArray, measured: parameters.Information
+) -> tuple[FloatArray, FloatArray]:
+    """G (n, 3, k) after measurements, by that before and the factor of y after; the correction (n, 3)."""
     count, _, size = shares.shape
     before, gradient = shares.reshape(3 * count, size), measured.gradient.reshape(-1)
     right = np.empty((3 * count, size + 1))
@@ -253,19 +224,14 @@ def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[
     solve(factor, right)
     after, correction = before - right[:, :size], right[:, size]
     if size:
-        _whiten(after, np.eye(size) + _lower_product(weighted, after))
+        # I + (T G)^T G after, of which the lower triangle is used: in panels that skip part of the upper one
+        product = np.zeros((size, size))
+        for panel in np.array_split(np.arange(size), min(_PANELS, size)):
+            begin, end = panel[0], panel[-1] + 1
+            np.matmul(weighted[:, begin:].T, after[:, begin:end], out=product[begin:, begin:end])
+        _whiten(after, np.eye(size) + product)
         correction = correction + after @ (after.T @ gradient)
     return after.reshape(count, 3, size), correction.reshape(count, 3)
-
-
-def _lower_product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """The lower triangle of left^T right for columns (n, k), in panels that skip part of the upper one."""
-    size = left.shape[1]
-    out = np.zeros((size, size))
-    for panel in np.array_split(np.arange(size), min(_PANELS, size)):
-        begin, end = panel[0], panel[-1] + 1
-        np.matmul(left[:, begin:].T, right[:, begin:end], out=out[begin:, begin:end])
-    return out
 
 
 def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
@@ -284,7 +250,7 @@ def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
 
 
 @cached_njit
-def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
+def _weigh(measured: parameters.Information, shares: FloatArray, out: FloatArray) -> None:
     """Write T G to the first columns of `out` (3 n, k + 1) for G (3 n, k)."""
     size = shares.shape[1]
     out[:, :size] = 0.0
@@ -315,14 +281,9 @@ def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
 def change_shared(
     covariance: FloatArray, pattern: Pattern, place: IntArray, old: FloatArray, new: FloatArray
 ) -> None:
-    """Change the covariances of y from old to new copies, for all pairs of a pattern.
+    """Change the covariances (n, n, 3, 3) of y from old to new copies, by G (n, 3, k), of a pattern's pairs.
 
-    Args:
-        covariance: (n, n, 3, 3) of y, changed.
-        pattern: Pairs to change.
-        place: Numbers of the pattern's bodies in `covariance`.
-        old: (n, 3, k) G of the old copies.
-        new: (n, 3, k) G of the new copies.
+    `place` has the numbers of the pattern's bodies in `covariance`.
     """
     for f in range(pattern.pivot_begin.size - 1):
         pivots = place[pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]]
@@ -388,7 +349,7 @@ class SparseFilter:
     def __init__(self, table: ParameterTable) -> None:
         count = table.filter_size // 3
         self.covariance: FloatArray = np.zeros((0, 0))
-        self._marginals = Marginals(Groups.of(table))
+        self._marginals = Marginals(parameters.Groups.of(table))
         self._place: FloatArray = np.zeros((count, 2))
         self._number: IntArray = np.full(count, -1)
         self._factor = EMPTY
@@ -418,7 +379,7 @@ class SparseFilter:
         return self._marginals.transition
 
     @property
-    def _groups(self) -> Groups:
+    def _groups(self) -> parameters.Groups:
         return self._marginals.groups
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -447,8 +408,8 @@ class SparseFilter:
 
     def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
-        self._place[bodies] = centres(covariances)
-        own = carried(self._place[bodies], covariances)
+        self._place[bodies] = parameters.centres(covariances)
+        own = parameters.carried(self._place[bodies], covariances)
         self._append(bodies, [Derived(_NOBODY, np.zeros((0, 3)), one) for one in own])
         self._marginals.set_prior(bodies, np.arange(3), covariances)
 
@@ -469,7 +430,7 @@ class SparseFilter:
     def append_columns(self, table: ParameterTable) -> None:
         """Append the additional columns of a table, without error; their prior is set next."""
         more = table.filter_size // 3 - self._number.size
-        self._marginals.append_columns(Groups.of(table))
+        self._marginals.append_columns(parameters.Groups.of(table))
         self._place = np.concatenate([self._place, np.zeros((more, 2))])
         self._number = np.concatenate([self._number, np.full(more, -1)])
         self._ordering = None
@@ -485,14 +446,14 @@ class SparseFilter:
         placed, self._new = self._new[-1], self._new[:-1]
         for other in np.unique(bodies).tolist():
             self._take_in(other)
-        adjoint = translation_adjoints(self._place[[body]])[0]
-        back = translation_adjoints(-self._place[bodies])
+        adjoint = parameters.translation_adjoints(self._place[[body]])[0]
+        back = parameters.translation_adjoints(-self._place[bodies])
         shares = adjoint @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
-        alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
+        alike = np.linalg.cholesky(parameters.carried(self._place[bodies], self.marginal[bodies, :3, :3]))
         common = np.sum(shares @ alike, axis=0)
         gain = shares.transpose(0, 2, 1).reshape(-1, 3)
         self._append(columns[:1] // 3, [Derived(self._number[bodies], gain, placed.spread)])
-        more = carried(-self._place[[body]], (common @ common.T)[None])
+        more = parameters.carried(-self._place[[body]], (common @ common.T)[None])
         own = self.marginal[[body], :3, :3] + more
         self._marginals.set_prior(np.array([body]), np.arange(3), own)
 
@@ -517,14 +478,7 @@ class SparseFilter:
         return np.asarray(self.marginal[body][np.ix_(own, own)])
 
     def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
-        """Write the covariances between the bodies of measurements (m,), before an update with them.
-
-        Args:
-            columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
-            robots: Positions of all robots.
-            cross_covariance: (m, 3, 6) written: of observers with targets, and of targets with cameras;
-                undefined where there is none.
-        """
+        """Write covariances (m, 3, 6) between bodies, see `JointFilter`; undefined where there are none."""
         tied = (columns[:, :2] >= 0).all(axis=1)
         bodies = columns // 3
         prepared = self._prepare(bodies[tied, :2], robots)
@@ -552,9 +506,9 @@ class SparseFilter:
             copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
             others = renewed(factor, shares, self._number[copied])
         if moves.any():
-            move(covariance, pattern, self._number, moves)
-            shares = moved_shares(shares, self._number, moves)
-            others = None if others is None else moved_shares(others, self._number, moves)
+            parameters.move(covariance, pattern, self._number, moves)
+            shares = parameters.moved_shares(shares, self._number, moves)
+            others = None if others is None else parameters.moved_shares(others, self._number, moves)
         if others is not None:
             change_shared(covariance, pattern, self._number, shares, others)
             shares = others
@@ -562,23 +516,18 @@ class SparseFilter:
         for (row, column), of, first, second in self._marginals.within(bodies):  # of bodies and their blocks
             covariance[self._number[first], self._number[second]] += noise[of, row, column]
         prior = Prior(covariance, self._number)
-        self._prepared = _Prepared(pattern, prior, self._by_body(shares, active), active)
-        return self._prepared
-
-    def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
-        """Shares of copies (n, 3, r) of all bodies, from those by number."""
         numbers = self._number[active]
-        if np.array_equal(numbers, np.arange(self._number.size)):
-            return shares  # all bodies are active, with unchanged numbers
-        by_body = np.zeros((self._number.size, 3, shares.shape[2]))
-        by_body[active] = shares[numbers]
-        return by_body
+        if not np.array_equal(numbers, np.arange(self._number.size)):  # else all are active, as before
+            shares, of_numbers = np.zeros((self._number.size, 3, shares.shape[2])), shares
+            shares[active] = of_numbers[numbers]  # by body
+        self._prepared = _Prepared(pattern, prior, shares, active)
+        return self._prepared
 
     def _move_far(self, active: IntArray, places: FloatArray) -> None:
         """Move the reference points of bodies that are far from them to their present positions."""
         moved = places[active] - self._place[active]
         far = active[np.hypot(moved[:, 0], moved[:, 1]) > _FAR_M]
-        turns = translation_adjoints(places[far] - self._place[far])
+        turns = parameters.translation_adjoints(places[far] - self._place[far])
         for body, turn in zip(far[:, None], turns, strict=True):
             self._append(body, [Derived(self._number[body], turn.T.copy(), np.zeros((3, 3)))])
         self._place[far] = places[far]
@@ -591,9 +540,9 @@ class SparseFilter:
         self._pairs = (*self._pairs[1 - kept :], pairs)
         recent = np.concatenate(self._pairs)
         recent = recent[here[recent].all(axis=1)]
-        pairs = np.concatenate([recent, block_pairs(self._groups, here, recent)])
+        pairs = np.concatenate([recent, parameters.block_pairs(self._groups, here, recent)])
         bodies = active[self._groups.part[active] == 0]
-        situation = Situation(bodies, active_blocks(self._groups, here), places, pairs)
+        situation = Situation(bodies, parameters.active_blocks(self._groups, here), places, pairs)
         self._ordering = ordered(situation, self._ordering)
         return self._ordering.pattern
 
@@ -601,61 +550,47 @@ class SparseFilter:
         self, covariance_of: Callable[[IntArray, IntArray], FloatArray], first: IntArray, second: IntArray
     ) -> FloatArray:
         """Covariances (k, 3, 3) of pairs, with errors about the origin of `map` as in the columns."""
-        return carried_pairs(-self._place[first], covariance_of(first, second), -self._place[second])
+        return parameters.carried_pairs(
+            -self._place[first], covariance_of(first, second), -self._place[second]
+        )
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
-        """Use many measurements with independent errors at once; return the correction (n,) of all columns.
-
-        Their pairs must have been accepted to `prepare_update` before.
-
-        Args:
-            columns: (m, c) columns that each depends on, those of the two bodies first.
-            jacobian: (m, 3, c) Jacobians; a zero row is a component that was not measured.
-            innovation: (m, 3) measured minus predicted.
-            noise: (m, 3, 3) covariance of the measurement.
-        """
+        """Fuse measurements (m,) whose pairs are prepared, see `JointFilter`; return the correction (n,)."""
         if self._prepared is None:
             raise RuntimeError("call prepare_update before update")
         (pattern, prior, shares, active), self._prepared = self._prepared, None
-        measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
+        measured = parameters.summed(
+            parameters.information_of(columns, jacobian, innovation, noise, self._place)
+        )
         self._factor = eliminate(pattern, prior, measured)
         self._shares, correction = updated(self._factor, shares, measured)
-        count = self._number.size
+        count, self._new = self._number.size, ()
         self._number = np.full(count, -1)
         self._number[active] = active
-        self._new = ()
-        self._settle(active)
-        moved = np.einsum("nij,nj->ni", translation_adjoints(-self._place[active]), correction[active])
-        out = np.zeros((count, 3))
-        out[active] = moved
-        return out.reshape(-1)
-
-    def _settle(self, active: IntArray) -> None:
-        """Compute the marginals of the newest factor and copies."""
+        # Marginals of the newest factor and copies.
         covariance = self._workspace.with_fronts(self._factor)
         bodies = active[self._groups.part[active] == 0]
         for (row, column), of, first, second in self._marginals.within(bodies):
             own = covariance[first, second] + shared(self._shares, first, second)
-            own = carried_pairs(-self._place[first], own, -self._place[second])
+            own = parameters.carried_pairs(-self._place[first], own, -self._place[second])
             self.marginal[bodies[of], row, column] = own
         self._marginals.settle(bodies)
+        moved = np.einsum(
+            "nij,nj->ni", parameters.translation_adjoints(-self._place[active]), correction[active]
+        )
+        out = np.zeros((count, 3))
+        out[active] = moved
+        return out.reshape(-1)
 
 
 class _Workspace:
-    """Covariances between two updates, shared by a filter and all its copies.
-
-    Args:
-        bodies: Initial number of bodies.
-
-    Attributes:
-        holds: The factor whose fronts are written there.
-    """
+    """Covariances between two updates of some bodies at first, shared by a filter and all its copies."""
 
     def __init__(self, bodies: int) -> None:
         self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
-        self.holds: Factor | None = None
+        self.holds: Factor | None = None  # The factor whose fronts are written there
         self._make(bodies)
 
     def with_fronts(self, factor: Factor, more: int = 0) -> FloatArray:

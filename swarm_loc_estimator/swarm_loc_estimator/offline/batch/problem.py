@@ -10,7 +10,7 @@ tracks and measurements, so that whatever a description states can be estimated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,19 +18,147 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, POLAR, RANGE, angles, is_compiled
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.offline.batch.parameters import Parameter, all_changed
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.sensors.fix import NO_FIXES
 from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, TURN_BIAS, ParameterTable
-from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_YAW,
+    CONTRADICTED_SURVEY_SIGMA,
+    TURN_BIAS,
+    ParameterTable,
+)
+from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.settings import Settings
+
+_SECTIONS = {
+    "odometry": OdometryModel,
+    "imu": ImuModel,
+    "camera": CameraMount,
+    "sensor": SensorModel,
+    "uwb": UwbDevice,
+}
+
+
+class Parameter(NamedTuple):
+    """A number of a robot's description."""
+
+    section: str  # Of the description
+    name: str  # In this section
+    sigma: float  # Standard deviation of the prior
+
+    @property
+    def moves(self) -> bool:
+        """Whether it changes the motion, not what the camera measures."""
+        return self.section in {"odometry", "imu"}
+
+    def of(self, robot: Robot) -> float:
+        """The number of a robot; NaN: it has no such section."""
+        return float(getattr(getattr(robot, self.section), self.name, np.nan))
+
+
+SURVEY = (
+    Parameter("odometry", "turn_bias", 0.01),
+    Parameter("odometry", "distance_scale", 0.03),
+    Parameter("odometry", "turn_scale", 0.05),
+    Parameter("imu", "turn_bias", 0.01),
+    Parameter("imu", "turn_scale", 0.05),
+    Parameter("camera", "yaw", 0.05),
+    Parameter("sensor", "distance_scale", 0.02),
+    Parameter("sensor", "range_offset", 0.1),
+)
+"""What a survey corrects."""
+_MOTION = (
+    Parameter("odometry", "turn_bias", 0.02),
+    Parameter("odometry", "distance_scale", 0.1),
+    Parameter("odometry", "turn_scale", 0.1),
+    Parameter("odometry", "delay_s", 0.1),
+    Parameter("imu", "turn_bias", 0.01),
+    Parameter("imu", "turn_scale", 0.05),
+)
+_BODY = (
+    Parameter("odometry", "course_offset", 0.05),
+    Parameter("odometry", "axle_offset", 0.05),
+)
+_MOUNT = (
+    Parameter("camera", "x", 0.03),
+    Parameter("camera", "y", 0.02),
+    Parameter("sensor", "time_offset_s", 0.03),
+)
+_POLAR = (
+    Parameter("sensor", "range_log_scale", 0.1),
+    Parameter("sensor", "range_skew", 0.05),
+    Parameter("sensor", "range_curve", 0.5),
+    Parameter("sensor", "range_offset", 0.1),
+    Parameter("sensor", "robot_range_offset", 0.05),
+    Parameter("sensor", "bearing_offset", 0.1),
+    Parameter("sensor", "bearing_scale", 0.1),
+    Parameter("sensor", "bearing_curve", 0.1),
+)
+_POSES = (
+    Parameter("camera", "yaw", 0.1),
+    Parameter("sensor", "distance_scale", 0.05),
+)
+_RADIO = (
+    Parameter("uwb", "range_bias", 0.2),
+    Parameter("uwb", "range_scale", 0.02),
+)
+
+
+def calibrated_parameters(*, polar: bool, poses: bool, ranges: bool, truth: bool) -> tuple[Parameter, ...]:
+    """What a calibration estimates of robots that see markers as ranges and bearings or poses, or anchors.
+
+    Where base_link is on a robot only ground truth tells; without it, it is where odometry has it.
+    """
+    seen = (*(_POLAR if polar else ()), *(_POSES if poses else ()), *(_RADIO if ranges else ()))
+    return (*_MOTION, *(_BODY if truth else ()), *_MOUNT, *seen)
+
+
+def values_of(swarm: Swarm, parameters: Sequence[Parameter]) -> FloatArray:
+    """The numbers (N, p) of all robots; NaN: it has no such section."""
+    return np.array([[one.of(robot) for one in parameters] for robot in swarm.robots])
+
+
+def corrections(before: Swarm, found: Swarm, parameters: Sequence[Parameter]) -> list[str]:
+    """A sentence for each robot of which some parameters were corrected."""
+    lines = []
+    for old, new in zip(before.robots, found.robots, strict=True):
+        pairs = [(f"{one.section}.{one.name}", one.of(old), one.of(new)) for one in parameters]
+        said = [f"{key} {a:.4f} -> {b:.4f}" for key, a, b in pairs if abs(b - a) > 0.0]
+        if said:
+            lines.append(f"Corrected for {new.name}: {', '.join(said)}.")
+    return lines
+
+
+def all_changed(swarm: Swarm, parameters: Sequence[Parameter], change: FloatArray) -> Swarm:
+    """The swarm with parameters of its robots changed by (N, p), within the ranges of a description."""
+    robots = [_changed(robot, parameters, row) for robot, row in zip(swarm.robots, change, strict=True)]
+    return replace(swarm, robots=tuple(robots))
+
+
+def opened(mark: Landmark) -> Landmark:
+    """A landmark that may be as far from its described place as the filter takes contradicted ones to be."""
+    position_sigma, yaw_sigma = CONTRADICTED_SURVEY_SIGMA
+    if mark.is_estimated:
+        return mark
+    return replace(mark, position_sigma=position_sigma, yaw_sigma=yaw_sigma)
+
+
+def _changed(robot: Robot, parameters: Sequence[Parameter], change: FloatArray) -> Robot:
+    new: dict[str, dict[str, float]] = {}
+    for one, step in zip(parameters, change.tolist(), strict=True):
+        if step and getattr(robot, one.section) is not None:
+            spec = number_specs(_SECTIONS[one.section])[one.name]
+            new.setdefault(one.section, {})[one.name] = min(max(one.of(robot) + step, spec.low), spec.high)
+    return replace(robot, **{name: replace(getattr(robot, name), **values) for name, values in new.items()})
+
 
 STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
 MAX_KNOTS = 12_000

@@ -16,12 +16,15 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.batch.lasting import counted_once, with_lasting_errors
-from swarm_loc_estimator.offline.batch.parameters import Parameter
-from swarm_loc_estimator.offline.batch.problem import problem_of
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
-from swarm_loc_estimator.offline.batch.start import Start, on_paths
+from swarm_loc_estimator.filter.correlated_noise import LENGTH_M, RADIO_LENGTH_M, REPEATED
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import POLAR, is_compiled, predict_any
+from swarm_loc_estimator.filter.prediction import GROWTH
+from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
+from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots, Parameter, opened, problem_of
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.inputs import kinds
@@ -29,12 +32,11 @@ from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_OFFSET,
     CAMERA_SCALE,
     CAMERA_YAW,
-    CONTRADICTED_SURVEY_SIGMA,
     DISTANCE_SCALE,
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
 MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
@@ -42,6 +44,7 @@ MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
 _FIXED = 1e-6  # Standard deviation of a parameter that is exact
 _CONTRADICTED = 0.5  # Weight below which the batch contradicts a measurement
 _CONTRADICTING = 0.15  # Share of the measurements of a robot or camera from which they contradict the others
+_MOVED = 16.3  # Squared distance from its described place from which a landmark was moved: 99.9 % [sigma^2]
 _USED = {"odometry", "imu", "detections", "fixes", "ranges"}  # Sensors
 _WITHOUT_FRAME = "it has no start, landmark or fix, so its poses are relative to a robot"
 
@@ -88,7 +91,7 @@ def smooth_recording(
     recording: Recording, online: ReplayResult, progress: Progress = unwatched
 ) -> ReplayResult:
     """Estimate all poses of a run over a recording again, see `smooth`."""
-    # the problem, as described and opened by contradictions, begun at the online poses
+    # the problem, as described and with landmarks opened by contradictions, begun at the online poses
     if not recording.odometry.robot.size:
         raise SmoothError(recording.name, "it has no odometry")
     if online.is_local.any():
@@ -108,9 +111,18 @@ def smooth_recording(
         raise SmoothError(recording.name, "no robot was located online")
     start = Start(nowhere, np.array(places).reshape(-1, 3), knot)
     problem = counted_once(problem)
-    # the solution, unless it contradicts much of a source
-    solver = Solver(problem, start, ParameterPrior(np.zeros_like(sigma), sigma))
+    # the solution; landmarks are opened only if they are not in their places by it, too
+    prior = ParameterPrior(np.zeros_like(sigma), sigma)
+    solver = Solver(problem, start, prior)
     solution = solver.solve(progress)
+    if swarm.landmarks != online.swarm.landmarks:
+        lasting = with_lasting_errors(problem, solution.knot, solution.landmark)
+        closed = _closed(online.swarm, solver.with_noise_of(lasting))
+        problem = replace(problem, swarm=replace(swarm, landmarks=closed))
+    if problem.swarm.landmarks != swarm.landmarks:
+        solver = Solver(problem, replace(start, knot=solution.knot, parameter=solution.parameter), prior)
+        solution = solver.solve(progress)
+    # unless it contradicts much of a source
     sources = problem.sightings.received_from
     for index, source in enumerate(swarm.sources):
         own = solution.weight[(sources == index) & solution.used]
@@ -149,17 +161,25 @@ def _opened(online: ReplayResult) -> Swarm:
     The batch does not estimate biases of robots' radios: they are those found online.
     """
     learned = online.self_calibrated or online.swarm
-    position_sigma, yaw_sigma = CONTRADICTED_SURVEY_SIGMA
     marks = tuple(
-        replace(mark, position_sigma=position_sigma, yaw_sigma=yaw_sigma)
-        if now.is_estimated and not mark.is_estimated
-        else mark
+        opened(mark) if now.is_estimated else mark
         for mark, now in zip(online.swarm.landmarks, learned.landmarks, strict=True)
     )
     robots = zip(online.swarm.robots, learned.robots, strict=True)
     return replace(
         online.swarm, robots=tuple(replace(one, uwb=now.uwb) for one, now in robots), landmarks=marks
     )
+
+
+def _closed(described: Swarm, solution: Solution) -> tuple[Landmark, ...]:
+    """The landmarks, as described where the solution has not moved them."""
+    marks = []
+    for index, mark in enumerate(described.landmarks):
+        off = solution.landmark[index] - (mark.x, mark.y, mark.yaw or 0.0)
+        off[2] = se2.wrap_angle(off[2]) if mark.yaw is not None else 0.0
+        far = nees(off[None], solution.landmark_covariance[index][None])[0]
+        marks.append(solution.problem.swarm.landmarks[index] if far > _MOVED else mark)
+    return tuple(marks)
 
 
 def _unsure(swarm: Swarm, learned: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
@@ -237,3 +257,83 @@ def covariances_at(
         total += (share * (1.0 - share))[:, None, None] * (turn @ slip @ turn.transpose(0, 2, 1))
         found[rows] = se2.pose_covariance(poses[rows], total)
     return found
+
+
+def counted_once(problem: BatchProblem) -> BatchProblem:
+    """The problem in which measurements of a link within their correlation time count as one.
+
+    Wheels are the less sure the longer nothing has measured their robot, lest the batch contradicts what does
+    so at last.
+    """
+    sightings = problem.sightings
+    order, same = _links(sightings)
+    share = np.empty(sightings.size)
+    share[order] = _shares(sightings, order, same)
+    covariance = sightings.covariance / share[:, None, None]
+    return replace(problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem))
+
+
+def with_lasting_errors(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> BatchProblem:
+    """The problem with the noise of errors that last, about knots (k, 3) and places (S, 3)."""
+    some, rows = problem.sightings, np.arange(problem.sightings.size)
+    # how far each end of a link has moved, as the other sees it
+    poses = problem.poses(rows, knot, place, problem.tracks)
+    predicted, *_ = predict_any(some, poses[0], poses[1], np.zeros((some.size, 3)))
+    seen, polar = predicted[:, :2].copy(), some.model == POLAR
+    cos, sin = np.cos(predicted[polar, 1]), np.sin(predicted[polar, 1])
+    seen[polar] = predicted[polar, :1] * np.column_stack([cos, sin])
+    order, same = _links(some)
+    a, b = order[:-1], order[1:]
+    moved = np.hypot(*(seen[b] - seen[a]).T) / np.where(is_compiled(some.model[b]), LENGTH_M, RADIO_LENGTH_M)
+    same &= ((some.observer[b] >= 0) | (some.mount[b] >= 0)) & np.isfinite(moved)  # no fixes
+    kept = np.where(same, np.exp(-np.where(same, moved, 0.0)), 0.0).tolist()
+    # sums of all that have the same error, before and after
+    own = _shares(some, order, same)
+    before, after = own.copy(), own.copy()
+    for k, left in enumerate(kept):
+        before[k + 1] += left * before[k]
+    for k in range(len(kept) - 1, -1, -1):
+        after[k] += kept[k] * after[k + 1]
+    factor = np.empty(some.size)
+    factor[order] = 1.0 + REPEATED * (before + after - own - 1.0).clip(min=0.0)
+    covariance = some.covariance * factor[:, None, None]
+    return replace(problem, sightings=some._replace(covariance=covariance))
+
+
+def _links(some: Measurements) -> tuple[IntArray, BoolArray]:
+    """Order (m,) of measurements, link by link, and whether each (m - 1,) but the first continues a link."""
+    columns = (some.received_from, some.observer, some.target, some.landmark, some.mount, some.model)
+    _, link = np.unique(np.stack([*columns, some.reading]), axis=1, return_inverse=True)
+    order = np.lexsort((some.stamp_ns, link.ravel()))
+    return order, np.asarray(np.diff(link.ravel()[order]) == 0)
+
+
+def _shares(some: Measurements, order: IntArray, same: BoolArray) -> FloatArray:
+    """By how much measurements (m,) in their order count, see `share_of` of `filter/sources.py`."""
+    a, b = order[:-1], order[1:]
+    since_ns = some.stamp_ns[b] - some.stamp_ns[a]
+    is_fix = (some.observer[b] < 0) & (some.mount[b] < 0)
+    share = np.clip(since_ns / CORRELATION_NS, LEAST_SHARE, 1.0)
+    share[(since_ns == 0) & ~is_fix] = 1.0
+    share[~is_compiled(some.model[b]) & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
+    return np.concatenate([np.ones(min(1, order.size)), np.where(same, share, 1.0)])
+
+
+def _unmeasured(problem: BatchProblem) -> Knots:
+    """Knots with noise of wheels that grows with the time to the nearest measurement of the robot."""
+    knots = problem.knots
+    covariance = knots.sample.covariance.copy()
+    for robot in np.unique(knots.robot).tolist():
+        own = np.flatnonzero(knots.robot == robot)
+        some, at_ns = problem.sightings, knots.stamp_ns[own]
+        if own.size < 2 or problem.swarm.robots[robot].stands:
+            continue
+        seen = np.sort(some.stamp_ns[(some.observer == robot) | (some.target == robot)])
+        middle_ns = at_ns[:-1] + np.diff(at_ns) // 2
+        place = np.searchsorted(seen, middle_ns)
+        far = np.append(np.append(-np.inf, seen.astype(float)), np.inf)
+        apart_s = 1e-9 * np.minimum(middle_ns - far[place], far[place + 1] - middle_ns)
+        growth = 1.0 + GROWTH * np.where(np.isfinite(apart_s), apart_s, 0.0)
+        steps = np.diff(covariance[own], axis=0) * growth[:, None, None]
+        covariance[own[1:]] = covariance[own[0]] + np.cumsum(steps, axis=0)
+    return replace(knots, sample=knots.sample._replace(covariance=covariance))

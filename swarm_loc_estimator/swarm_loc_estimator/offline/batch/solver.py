@@ -3,12 +3,13 @@
 Errors are right-invariant, X = exp(xi) X_hat, as in the filter, whose measurement models and odometry noise
 are used. Weights of Geman and McClure of whole sightings limit the influence of wrong ids; they are wide at
 first, when places are far off (graduated non-convexity). Steps are those of Levenberg and Marquardt.
+They begin at paths that are known, or at joined maps of single robots in the frames of their tracks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +22,172 @@ from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Drift, innovation
-from swarm_loc_estimator.offline.batch.start import Start
+from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
+
+_AGREES_M = 0.15
+"""Landmarks closer than this, or than a tenth of the distance between them, agree on an alignment."""
+
+
+@dataclass
+class Start:
+    """Where all begin."""
+
+    transform: FloatArray  # (N, 3) from the common frame to the track of each robot; NaN: not connected
+    landmark: FloatArray  # (L, 3) poses; NaN: not connected
+    knot: FloatArray | None = None  # (k, 3) transforms of tracks at knots, where paths are known
+    parameter: FloatArray | None = None  # (N, p) changes of parameters; None: the mean of their prior
+
+
+def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:
+    """Begin where robots are by paths in `map`; others as by `start_of`."""
+    start = start_of(problem)
+    return replace(start, knot=on_paths(problem, paths, start.transform))
+
+
+def on_paths(problem: BatchProblem, paths: Mapping[str, Trajectory], transform: FloatArray) -> FloatArray:
+    """Transforms (k, 3) of tracks at knots, by paths in `map`; those of robots (N, 3) without one."""
+    knots = problem.knots
+    knot = transform[knots.robot]
+    for index, robot in enumerate(problem.swarm.robots):
+        own, path = np.flatnonzero(knots.robot == index), paths.get(robot.name)
+        if path is None or not path.stamp_ns.size:
+            continue
+        track = problem.odometry.at(np.full(path.stamp_ns.size, index), path.stamp_ns).pose
+        middle = path.stamp_ns[:-1] + np.diff(path.stamp_ns) // 2
+        nearest = np.searchsorted(middle, knots.stamp_ns[own])
+        knot[own] = se2.compose(path.pose, se2.inverse(track))[nearest]
+    return knot
+
+
+def start_of(problem: BatchProblem) -> Start:
+    """Join the maps of all robots that share landmarks or see each other.
+
+    Begins with described landmarks and starts, else with the robot that has seen most landmarks, whose first
+    pose is then the origin.
+    """
+    swarm = problem.swarm
+    maps = [_map_of(problem, robot) for robot in range(len(swarm.robots))]
+    start = Start(np.full((len(swarm.robots), 3), np.nan), np.full((len(swarm.surveyed), 3), np.nan))
+    start.landmark[len(swarm.landmarks) :] = 0.0  # of anchors, the shift and bias
+    for index in np.flatnonzero(problem.is_known[: len(swarm.landmarks)]).tolist():
+        mark = swarm.landmarks[index]
+        start.landmark[index] = (mark.x, mark.y, mark.yaw or 0.0)
+    for index, robot in enumerate(swarm.robots):
+        if robot.start is not None and (problem.knots.robot == index).any():
+            _place(problem, start, maps, index, _at_first(problem, index, np.array(robot.start)))
+    if np.isnan(start.transform).all() and not problem.is_known.any():
+        seen = [int(np.isfinite(one).all(axis=1).sum()) for one in maps]
+        root = int(np.argmax(seen))
+        _place(problem, start, maps, root, _at_first(problem, root, np.zeros(3)))
+    while True:
+        waiting = np.flatnonzero(np.isnan(start.transform[:, 0])).tolist()
+        found = [(robot, *_alignment(problem, start, maps, robot)) for robot in waiting]
+        found = [one for one in found if one[2] > 0.0]
+        if not found:
+            return start
+        robot, transform, _ = max(found, key=lambda one: one[2])
+        _place(problem, start, maps, robot, transform)
+
+
+def _at_first(problem: BatchProblem, robot: int, pose: FloatArray) -> FloatArray:
+    """The transform of a robot's track with a pose (3,) at its first knot."""
+    first = int(np.flatnonzero(problem.knots.robot == robot)[0])
+    return se2.compose(pose, se2.inverse(problem.knots.sample.pose[first]))
+
+
+def _map_of(problem: BatchProblem, robot: int) -> FloatArray:
+    """Poses (L, 3) of the landmarks that a robot has seen, in the frame of its track; NaN: not seen."""
+    sightings, places = problem.sightings, np.full((len(problem.swarm.surveyed), 3), np.nan)
+    rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0) & problem.is_seen)
+    seen = _seen_at(problem, rows, problem.tracks[0, rows])
+    for index in np.unique(sightings.landmark[rows]).tolist():
+        own = seen[sightings.landmark[rows] == index]
+        x, y = np.median(own[:, :2], axis=0)
+        heading = own[np.isfinite(own[:, 2]), 2]
+        places[index] = (x, y, _median_angle(heading) if heading.size else 0.0)
+    return places
+
+
+def _seen_at(problem: BatchProblem, rows: IntArray, observer: FloatArray) -> FloatArray:
+    """Poses (k, 3) of the markers of sightings by robots at poses (k, 3); heading NaN: not seen."""
+    some, is_polar = select(problem.sightings, rows), problem.is_polar[rows]
+    value = some.value.copy()
+    distance, bearing = value[is_polar, 0].copy(), value[is_polar, 1].copy()
+    value[is_polar, 0], value[is_polar, 1] = distance * np.cos(bearing), distance * np.sin(bearing)
+    seen = se2.compose(se2.compose(observer, some.sensor), value)
+    seen[~some.has_heading, 2] = np.nan
+    return seen
+
+
+def _median_angle(angles: FloatArray) -> float:
+    """The angle whose distance to all others is least in sum."""
+    some = angles[:: max(1, angles.size // 200)]
+    return float(some[np.argmin(np.abs(se2.wrap_angle(some[:, None] - angles)).sum(axis=1))])
+
+
+def _place(
+    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int, transform: FloatArray
+) -> None:
+    """Place a robot's track, and the landmarks that nobody has placed before."""
+    start.transform[robot] = transform
+    new = np.isnan(start.landmark[:, 0]) & np.isfinite(maps[robot][:, 0]) & ~problem.is_known
+    start.landmark[new] = se2.compose(transform, maps[robot][new])
+
+
+def _alignment(
+    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int
+) -> tuple[FloatArray, float]:
+    """The transform of a robot's track on which most landmarks and robots agree, and how many do so."""
+    own = maps[robot]
+    both = np.flatnonzero(np.isfinite(own[:, 0]) & np.isfinite(start.landmark[:, 0]))
+    candidates = [
+        se2.rigid_fit(own[[i, j], :2], start.landmark[[i, j], :2])
+        for i in both.tolist()
+        for j in both.tolist()
+        if i < j
+    ]
+    by_robots = _by_robots(problem, start, robot)
+    candidates += by_robots[:: max(1, len(by_robots) // 50)]
+    best, most = np.zeros(3), 0.0
+    for candidate in candidates:
+        moved = se2.transform_points(candidate, own[both, :2])
+        size = 0.1 * np.linalg.norm(np.ptp(start.landmark[both, :2], axis=0)) if both.size else 0.0
+        off = np.linalg.norm(moved - start.landmark[both, :2], axis=1)
+        votes = float(np.sum(off < max(_AGREES_M, size))) - 1.0
+        if len(by_robots):
+            others = np.array(by_robots)
+            near = np.linalg.norm(others[:, :2] - candidate[:2], axis=1) < 3.0 * _AGREES_M
+            near &= np.abs(se2.wrap_angle(others[:, 2] - candidate[2])) < 0.5
+            votes += 2.0 * float(near.mean())
+        if votes > most:
+            best, most = candidate, votes
+    return best, most
+
+
+def _by_robots(problem: BatchProblem, start: Start, robot: int) -> list[FloatArray]:
+    """Transforms of a robot's track by sightings with heading, between it and placed robots."""
+    sightings = problem.sightings
+    placed = np.isfinite(start.transform[:, 0])
+    seen_by = np.flatnonzero((sightings.target == robot) & placed[sightings.observer] & sightings.has_heading)
+    observers = se2.compose(start.transform[sightings.observer[seen_by]], problem.tracks[0, seen_by])
+    markers = _seen_at(problem, seen_by, observers)
+    bodies = se2.compose(markers, se2.inverse(sightings.marker[seen_by]))
+    found = [*se2.compose(bodies, se2.inverse(problem.tracks[1, seen_by]))]
+    sees = np.flatnonzero(
+        (sightings.observer == robot)
+        & (sightings.target >= 0)
+        & placed[np.maximum(sightings.target, 0)]
+        & sightings.has_heading
+    )
+    if sees.size:
+        targets = se2.compose(start.transform[sightings.target[sees]], problem.tracks[1, sees])
+        markers = se2.compose(targets, sightings.marker[sees])
+        relative = _seen_at(problem, sees, problem.tracks[0, sees])
+        found += [*se2.compose(markers, se2.inverse(relative))]
+    return found
+
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
 _SCALES = (50.0, 20.0, 10.0, 5.0)
@@ -40,8 +204,6 @@ _LEAST_VARIANCE = 1e-10
 """Added to the variances of a step, so that the covariance of a standing robot is regular [m^2, rad^2]."""
 
 _PATH_NS = 50_000_000  # Time between two poses of a path
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -106,10 +268,8 @@ class Solution:
         """Variances (c, 3) of motion from knots (c,) to later ones (c,), in the frame of the first."""
         poses = se2.compose(self.knot[first], self.problem.knots.sample.pose[first])
         to_body = se2.adjoint(se2.inverse(poses))
-        columns = self.column[np.stack([first, last], axis=1)][:, :, None] + np.arange(3)
-        return self.factor.variances(
-            np.concatenate([-to_body, to_body], axis=2), columns.reshape(first.size, 6)
-        )
+        columns = np.column_stack([_three(self.column[first]), _three(self.column[last])])
+        return self.factor.variances(np.concatenate([-to_body, to_body], axis=2), columns)
 
 
 class ParameterPrior(NamedTuple):
@@ -171,14 +331,12 @@ class Solver:
         for k, scale in enumerate(_SCALES):
             progress(k / len(_SCALES), "solving")
             self._descend(scale)
-        normal, _ = self._normal(_SCALES[-1])
-        return self._solution(normal.factored(0.0))
+        return self.with_noise_of(self._problem)
 
     def with_noise_of(self, problem: BatchProblem) -> Solution:
         """The same solution with the covariances of a problem with other noise of measurements."""
         self._problem = problem
-        normal, _ = self._normal(_SCALES[-1])
-        return self._solution(normal.factored(0.0))
+        return self._solution(self._normal(_SCALES[-1])[0].factored(0.0))
 
     def _solve_rigid(self) -> None:
         """Solve with exact odometry: one transform of each robot's track, in the border."""
@@ -224,11 +382,10 @@ class Solver:
         self._knot, self._landmark, self._parameter, self._drift, _ = best
 
     def _apply(self, step: FloatArray) -> None:
-        """Move all estimates by a step (n,)."""
         self._knot, self._landmark = self._knot.copy(), self._landmark.copy()
         for pose, column in ((self._knot, self._knot_column), (self._landmark, self._landmark_column)):
             rows = np.flatnonzero(column >= 0)
-            twist = step[column[rows][:, None] + np.arange(3)]
+            twist = step[_three(column[rows])]
             moved = se2.compose(se2.exp(twist), pose[rows])
             is_shift = self._is_shift[rows] if column is self._landmark_column else np.zeros(rows.size, bool)
             pose[rows] = np.where(is_shift[:, None], pose[rows] + twist, moved)
@@ -269,14 +426,8 @@ class Solver:
         by_pose = np.einsum("kij,kjl->kil", root, back)
         by_parameter = -np.einsum("kij,kjl->kil", root, response)
         jacobian = np.concatenate([-by_pose, by_pose, by_parameter], axis=2)
-        columns = np.concatenate(
-            [
-                self._knot_column[a][:, None] + np.arange(3),
-                self._knot_column[b][:, None] + np.arange(3),
-                self._parameter_column[robot],
-            ],
-            axis=1,
-        )
+        of_knots = _three(self._knot_column[a]), _three(self._knot_column[b])
+        columns = np.column_stack([*of_knots, self._parameter_column[robot]])
         drifts = self._problem.drift
         if drifts is None:
             normal.add(jacobian, columns, residual)
@@ -336,7 +487,7 @@ class Solver:
         root = se2.adjoint(se2.inverse(true)) / _TRUE_SIGMA[:, None]
         pose = se2.compose(self._knot[knot], track)
         residual = np.einsum("kij,kj->ki", root, se2.log(se2.compose(pose, se2.inverse(true))))
-        normal.add(root, self._knot_column[knot][:, None] + np.arange(3), residual)
+        normal.add(root, _three(self._knot_column[knot]), residual)
         return float(np.sum(residual**2))
 
     def _anchors(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
@@ -426,7 +577,7 @@ class Solver:
         for side, (knot, place) in enumerate(zip(sides, (some.mount, some.landmark), strict=True)):
             first = np.where(knot >= 0, self._knot_column[knot], np.append(self._landmark_column, -1)[place])
             own = slice(3 * side, 3 * side + 3)
-            columns[:, own] = np.where((first >= 0)[:, None], first[:, None] + np.arange(3), -1)
+            columns[:, own] = np.where((first >= 0)[:, None], _three(first), -1)
         columns[:, 6:] = self._parameter_column[robot]
         if problem.drift:
             by_yaw = np.where((sides[0] >= 0)[:, None], by_camera[:, :, 0], 0.0)
@@ -449,22 +600,9 @@ class Solver:
         sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight
-        return Solution(
-            self._problem,
-            self._knot,
-            self._landmark,
-            self._parameter,
-            sigma,
-            covariance,
-            weight,
-            self.used,
-            ratio,
-            factor,
-            self._knot_column,
-            self._landmark_column,
-            self._parameter_column,
-            sightings,
-        )
+        found = self._problem, self._knot, self._landmark, self._parameter
+        columns = self._knot_column, self._landmark_column, self._parameter_column
+        return Solution(*found, sigma, covariance, weight, self.used, ratio, factor, *columns, sightings)
 
 
 def _add_prior(
@@ -474,6 +612,11 @@ def _add_prior(
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     normal.add(root[None], columns[None], (root @ residual)[None])
     return float(np.sum((root @ residual) ** 2))
+
+
+def _three(first: IntArray) -> IntArray:
+    """Columns (k, 3) of poses by their first ones (k,)."""
+    return first[:, None] + np.arange(3)
 
 
 def _numbered(wanted: BoolArray, first: int, size: int = 3) -> tuple[IntArray, int]:

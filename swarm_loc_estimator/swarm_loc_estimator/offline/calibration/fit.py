@@ -13,19 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.batch.problem import problem_of
-from swarm_loc_estimator.offline.batch.solver import Solver
-from swarm_loc_estimator.offline.batch.start import started_at
-from swarm_loc_estimator.offline.calibration.camera import errors_of
+from swarm_loc_estimator.offline.batch.problem import calibrated_parameters, corrections, problem_of
+from swarm_loc_estimator.offline.batch.solver import Solver, started_at
 from swarm_loc_estimator.offline.calibration.models import (
     RUN_TICK_S,
     FittedModels,
@@ -37,16 +36,18 @@ from swarm_loc_estimator.offline.calibration.models import (
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     Recording,
+    recording_of,
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.robust import spread
+from swarm_loc_estimator.offline.calibration.sightings import errors_of, spread
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS
+from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS, Batch
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 # Checked by make bench-mrclam: parameters are fitted to set 1 and measured on set 2.
 TICK_S = 1.0  # Interval at which errors are computed
@@ -225,16 +226,14 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     scores = [
         score([rerun(recording, started_at_truth(s, recording), RUN_TICK_S)]) for s in (swarm, calibrated)
     ]
-    check = _warning_alone if options.alone else _warning
-    warning = "" if options.plain else check(folds, swarm, noise)
+    check, is_checked = _warning_alone if options.alone else _warning, all(one.is_held_out for one in folds)
+    warning = "" if options.plain else check(folds, swarm, noise) if is_checked else _UNCHECKED
     kept = swarm if options.alone and warning else calibrated
     return Calibration(kept, whole, noise, scores[0], scores[1], warning)
 
 
 def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> str:
     """A sentence if a half is not better with the models of the other half than with the description."""
-    if not all(fold.is_held_out for fold in folds):
-        return _UNCHECKED
     for fold in folds:
         described = started_at_truth(swarm, fold.recording)
         fitted_m, *described_m = (
@@ -255,8 +254,6 @@ def _warning_alone(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float])
 
     Paths do not tell: those of the new description are as far off as it is.
     """
-    if not all(fold.is_held_out for fold in folds):
-        return _UNCHECKED
     for fold in folds:
         fitted, described = (_scatter(fold, with_noise(one, noise)) for one in (fold.swarm, swarm))
         ratio = float(np.exp(np.mean(np.log(fitted / described))))
@@ -279,20 +276,41 @@ def _scatter(fold: Fold, swarm: Swarm) -> FloatArray:
 
 
 def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Options) -> list[Fold]:
-    """Each half of the recording with the models of the other half; if that has too little, of the whole."""
+    """Halves of all bags with the models of the other halves; if these have too little, of the whole.
+
+    Without ground truth each bag is judged by itself: none may lose by what the others tell.
+    """
     if options.plain:
         return [Fold(recording, started_at_truth(whole.swarm, recording))]
-    first_ns, last_ns = recording.range_ns
-    middle_ns = (first_ns + last_ns) // 2
-    halves = [recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)]
+    early, late = recording.halves_ns
     # robots begin the second half where nobody has described
     later = replace(swarm, robots=tuple(replace(one, start=None) for one in swarm.robots))
     folds = []
-    for half, fitted, begin in ((halves[0], halves[1], later), (halves[1], halves[0], swarm)):
-        run = replace(half, truth=whole.paths) if options.alone else half
+    for held, used, begin in ((early, late, later), (late, early, swarm)):
         try:
-            models = fit_models(fitted, begin, options, unwatched)
+            models = fit_models(recording.between(*used), begin, options, unwatched)
         except CalibrationError:
             models = whole
-        folds.append(Fold(run, started_at_truth(models.swarm, run), models is not whole))
+        for spans in [[span] for span in held] if options.alone else [held]:
+            run = recording.between(*spans)
+            run = replace(run, truth=whole.paths) if options.alone else run
+            folds.append(Fold(run, started_at_truth(models.swarm, run), models is not whole))
     return folds
+
+
+def refined(parts: Sequence[Batch], swarm: Swarm, path: Path) -> tuple[bool, str]:
+    """Fit a description to inputs of a run, and write it beside that of a path; whether so, and a text."""
+    beside = path.with_suffix(f".refined{path.suffix}")
+    try:
+        done = calibrate(recording_of(path.name, parts, swarm), swarm, Options(alone=True), unwatched)
+        if done.warning:
+            return False, done.warning
+        save_swarm(done.swarm, beside, f"Proposed in place of {path.name} by the first minutes of a run.")
+    except UserError as error:
+        return False, f"Nothing is refined: {error}"
+    parameters = calibrated_parameters(polar=True, poses=True, ranges=True, truth=False)
+    changes = corrections(swarm, done.swarm, parameters)
+    robots = zip(swarm.robots, done.swarm.robots, strict=True)
+    tables = [new.name for old, new in robots if old.response != new.response]
+    changes += [f"Other scale factors by speed: {', '.join(tables)}."] if tables else []
+    return True, "\n".join([f"{beside} is proposed in place of {path.name}, which stays in use.", *changes])

@@ -12,32 +12,41 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.models import RANGE
-from swarm_loc_estimator.offline.batch.parameters import all_changed, calibrated_parameters, values_of
-from swarm_loc_estimator.offline.batch.problem import BatchProblem, problem_of
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
-from swarm_loc_estimator.offline.batch.start import started_at
-from swarm_loc_estimator.offline.calibration.camera import MIN_SIGHTINGS, CameraFit, camera_fits
+from swarm_loc_estimator.offline.batch.problem import (
+    BatchProblem,
+    all_changed,
+    calibrated_parameters,
+    opened,
+    problem_of,
+    values_of,
+)
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, started_at
 from swarm_loc_estimator.offline.calibration.motion import (
-    DENSE_GAP_NS,
     WINDOW_S,
     Drive,
     Lateness,
     biased,
+    drive_of,
     explained,
     fit_lateness,
     fit_response,
-    steps_of,
-    true_motion,
     windows,
 )
 from swarm_loc_estimator.offline.calibration.recording import (
+    DENSE_GAP_NS,
     CalibrationError,
     Recording,
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.robust import population, spread
-from swarm_loc_estimator.offline.calibration.scatter import with_scatter
+from swarm_loc_estimator.offline.calibration.sightings import (
+    MIN_SIGHTINGS,
+    CameraFit,
+    camera_fits,
+    population,
+    spread,
+    with_scatter,
+)
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm
@@ -137,7 +146,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 
     Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
     and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
-    are more rounds.
+    are more rounds, and landmarks may be a little off, lest their errors seem to be those of wheels there.
 
     Raises:
         CalibrationError: Too little is known about the poses of robots.
@@ -151,7 +160,8 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
             f" drive; without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or anchors, or"
             " of other robots."
         )
-    current = started_at_truth(swarm, recording) if truth else swarm
+    current = replace(swarm, landmarks=tuple(map(opened, swarm.landmarks)))
+    current = started_at_truth(swarm, recording) if truth else current
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
     seen, polar = begin.is_seen, begin.is_polar
@@ -187,7 +197,9 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     starts = [
         replace(one, start=old.start) for one, old in zip(models.swarm.robots, swarm.robots, strict=True)
     ]
-    found = replace(models.swarm, robots=tuple(starts), anchors=_anchors(swarm, solution))
+    found = replace(
+        models.swarm, robots=tuple(starts), landmarks=swarm.landmarks, anchors=_anchors(swarm, solution)
+    )
     return replace(models, swarm=found)
 
 
@@ -227,7 +239,6 @@ def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[Float
 
 
 def _is_dense(path: Trajectory) -> bool:
-    """Whether most of a path is known without gaps."""
     return path.stamp_ns.size > 1 and float(np.median(np.diff(path.stamp_ns))) <= DENSE_GAP_NS
 
 
@@ -301,9 +312,8 @@ def _fit_drive(
         track, path = recording.track(index), paths.get(swarm.robots[index].name)
         if path is None or track.stamp_ns.size < 2:
             continue
-        begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
-        drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(path, begin_ns, end_ns))
-        if windows(drive.motion, WINDOW_S)[0].size >= _MIN_WINDOWS:
+        drive = drive_of(track, swarm.robots[index].odometry, path)
+        if windows(drive, WINDOW_S)[0].size >= _MIN_WINDOWS:
             drives[index] = drive
     if not drives:
         return None
@@ -365,7 +375,6 @@ def _with_own_noise(robot: Robot, index: int, found: BatchProblem, solution: Sol
 
 
 def _with_motion(robot: Robot, index: int, drive: DriveFit) -> Robot:
-    """The robot with the delay, lag and scale factors of its type."""
     late, response = drive.late, drive.response
     numbers = {
         "delay_s": round(late.delay_s, 4),
@@ -374,7 +383,7 @@ def _with_motion(robot: Robot, index: int, drive: DriveFit) -> Robot:
         "turn_scale": 1.0,
     }
     if index in drive.drives:
-        bias = drive.drives[index].steps.turn_bias
+        bias = drive.drives[index].turn_bias
         numbers["turn_bias"] = round(float(bias[np.argmax(np.abs(bias))]), 5)
     if response is not None and len(response.speeds) == len(response.turn_rates) == 1:
         numbers["distance_scale"] = response.speed_share[0][0]
@@ -410,9 +419,9 @@ def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str,
     path = turn = seconds = path2 = turn2 = 0.0
     for fit in motion:
         for drive in fit.drives.values():
-            first, last = windows(drive.motion, WINDOW_S)
-            path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
-            turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))
+            first, last = windows(drive, WINDOW_S)
+            path += float(np.sum(np.abs(drive.path[last] - drive.path[first])))
+            turn += float(np.sum(np.abs(drive.turn[last] - drive.turn[first])))
             seconds += WINDOW_S * first.size
         # errors by a path that follows the odometry are too small by its own variance
         path2 += float(np.sum(fit.after[:, 0] ** 2 + fit.doubt[0]))
@@ -432,7 +441,6 @@ def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str,
 def _remarks(
     swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
 ) -> list[str]:
-    """One sentence for everything that could not be fitted."""
     names = ", ".join(swarm.robots[index].name for index in members)
     remarks = [
         f"{fit.robot.name} has too few sightings whose truth is known: it gets the mean of its type."

@@ -12,18 +12,17 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.calibration.robust import ridge, spread
+from swarm_loc_estimator.offline.calibration.recording import DENSE_GAP_NS
+from swarm_loc_estimator.offline.calibration.sightings import ridge, spread
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 
-DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
 LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0
 
@@ -46,32 +45,18 @@ _SETTLING_S = 5.0
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Speeds between consecutive odometry messages."""
+class Drive:
+    """One robot's reported motion between odometry messages, and its true one on a regular grid of time."""
 
     stamp_ns: IntArray  # (n + 1,) of the messages
     speed: FloatArray  # (n,) reported [m/s]
     turn_rate: FloatArray  # (n,) reported [rad/s]
     turn_bias: FloatArray  # (n,) true minus scaled turn rate [rad/s], the same while the robot moves
     duration_s: FloatArray  # (n,)
-
-
-@dataclass(frozen=True)
-class TrueMotion:
-    """A robot's true motion, accumulated on a regular grid of time."""
-
-    time_s: FloatArray  # (g,) since the first odometry
-    path: FloatArray  # (g,) [m], forwards
-    turn: FloatArray  # (g,) heading, unwrapped [rad]
-    known: npt.NDArray[np.bool_]  # (g,) whether the ground truth is dense there
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One robot's reported and true motion."""
-
-    steps: Steps
-    motion: TrueMotion
+    time_s: FloatArray  # (g,) since the first message
+    path: FloatArray  # (g,) true [m], forwards
+    turn: FloatArray  # (g,) true heading, unwrapped [rad]
+    known: BoolArray  # (g,) whether the ground truth is dense there
 
 
 @dataclass(frozen=True)
@@ -82,63 +67,61 @@ class Lateness:
     lag_s: float  # Time constant of a first-order lag
 
 
-def steps_of(track: Trajectory, model: OdometryModel) -> Steps:
-    """The reported motion between messages; zero for steps that the estimator would reject."""
+def drive_of(track: Trajectory, model: OdometryModel, truth: Trajectory) -> Drive:
+    """The motion of a robot by its odometry, without what the estimator would reject, and by its truth."""
     duration_s = np.maximum(np.diff(track.stamp_ns) * 1e-9, 1e-6)
-    turn = se2.wrap_angle(np.diff(track.pose[:, 2]))
-    middle = track.pose[:-1, 2] + 0.5 * turn
-    dx, dy = np.diff(track.pose[:, :2], axis=0).T
-    distance = np.cos(middle) * dx + np.sin(middle) * dy
+    apart = np.linalg.norm(np.diff(track.pose[:, :2], axis=0), axis=1)
     plausible = (duration_s <= model.timeout_s) & (
-        np.hypot(dx, dy) <= model.max_speed * duration_s + 0.5 * model.wheel_separation
+        apart <= model.max_speed * duration_s + 0.5 * model.wheel_separation
     )
     zero = np.where(plausible, 1.0 / duration_s, 0.0)
-    return Steps(track.stamp_ns, distance * zero, turn * zero, np.zeros(duration_s.size), duration_s)
+    speed, turn_rate = (zero * one for one in _moved(track.pose))
+    time_s = np.arange(0.0, (track.stamp_ns[-1] - track.stamp_ns[0]) * 1e-9, GRID_S)
+    at_ns = track.stamp_ns[0] + np.rint(time_s * 1e9).astype(np.int64)
+    pose, known = interpolate(truth, at_ns, DENSE_GAP_NS)
+    pose[~known] = 0.0
+    path, turn = (np.concatenate([[0.0], np.cumsum(one)]) for one in _moved(pose))
+    return Drive(
+        track.stamp_ns, speed, turn_rate, np.zeros(duration_s.size), duration_s, time_s, path, turn, known
+    )
+
+
+def _moved(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ways forwards (n - 1,) and turns (n - 1,) between poses (n, 3)."""
+    turn = se2.wrap_angle(np.diff(pose[:, 2]))
+    middle = pose[:-1, 2] + 0.5 * turn
+    dx, dy = np.diff(pose[:, :2], axis=0).T
+    return np.cos(middle) * dx + np.sin(middle) * dy, turn
 
 
 def biased(drive: Drive, late: Lateness, response: MotionResponse) -> Drive:
     """The drive with the turn bias that its turns show with a table of scale factors, by regression."""
-    steps = drive.steps
-    moves = np.where((np.abs(steps.speed) > _MOVING) | (np.abs(steps.turn_rate) > _MOVING), 1.0, 0.0)
-    first, last = windows(drive.motion, WINDOW_S)
+    moves = np.where((np.abs(drive.speed) > _MOVING) | (np.abs(drive.turn_rate) > _MOVING), 1.0, 0.0)
+    first, last = windows(drive, WINDOW_S)
     integral = gathered(moves[:, None], drive, late)
     moving_s, missed = integral[last] - integral[first], explained([drive], late, response)[:, 1]
     penalty = np.array([[_OVERLAP * (spread(missed) / _BIAS_SIGMA) ** 2 / max(1, missed.size)]])
     change = ridge(moving_s, missed, penalty, np.zeros(1))[0]
-    return replace(drive, steps=replace(steps, turn_bias=steps.turn_bias + change * moves))
+    return replace(drive, turn_bias=drive.turn_bias + change * moves)
 
 
-def true_motion(truth: Trajectory, begin_ns: int, end_ns: int) -> TrueMotion:
-    """The true motion between two stamps."""
-    time_s = np.arange(0.0, (end_ns - begin_ns) * 1e-9, GRID_S)
-    pose, known = interpolate(truth, begin_ns + np.rint(time_s * 1e9).astype(np.int64), DENSE_GAP_NS)
-    pose[~known] = 0.0
-    turn = se2.wrap_angle(np.diff(pose[:, 2]))
-    middle = pose[:-1, 2] + 0.5 * turn
-    dx, dy = np.diff(pose[:, :2], axis=0).T
-    path = np.cos(middle) * dx + np.sin(middle) * dy
-    path, turn = (np.concatenate([[0.0], np.cumsum(column)]) for column in (path, turn))
-    return TrueMotion(time_s, path, turn, known)
-
-
-def windows(motion: TrueMotion, length_s: float) -> tuple[IntArray, IntArray]:
+def windows(drive: Drive, length_s: float) -> tuple[IntArray, IntArray]:
     """First and last grid index of windows with dense ground truth."""
     length = max(1, round(length_s / GRID_S))
     settling = round(_SETTLING_S / GRID_S)
-    first = np.arange(settling, motion.time_s.size - length, max(length // 8, 5))
-    gaps = np.concatenate([[0], np.cumsum(~motion.known)])
+    first = np.arange(settling, drive.time_s.size - length, max(length // 8, 5))
+    gaps = np.concatenate([[0], np.cumsum(~drive.known)])
     first = first[gaps[first + length + 1] == gaps[first]]
     return first, first + length
 
 
 def gathered(values: FloatArray, drive: Drive, late: Lateness) -> FloatArray:
     """Integral (g, p) over the grid of rates (n, p) that are constant during steps, with delay and lag."""
-    steps, time_s = drive.steps, drive.motion.time_s
-    ends = (steps.stamp_ns - steps.stamp_ns[0]) * 1e-9 + late.delay_s
+    ends = (drive.stamp_ns - drive.stamp_ns[0]) * 1e-9 + late.delay_s
     total = np.concatenate(
-        [np.zeros((1, values.shape[1])), np.cumsum(values * steps.duration_s[:, None], axis=0)]
+        [np.zeros((1, values.shape[1])), np.cumsum(values * drive.duration_s[:, None], axis=0)]
     )
-    share = np.interp(time_s, ends, np.arange(ends.size))
+    share = np.interp(drive.time_s, ends, np.arange(ends.size))
     row = np.minimum(share.astype(np.int64), ends.size - 2)
     on_grid: FloatArray = total[row] + (share - row)[:, None] * (total[row + 1] - total[row])
     if late.lag_s <= 0.0:
@@ -160,12 +143,11 @@ def fit_lateness(drives: Sequence[Drive], least_share: float = _CLEARLY) -> Late
             return float("inf")
         total = 0.0
         for drive in drives:
-            moving = np.abs(drive.steps.speed) > _MOVING
-            values = drive.steps.turn_rate[:, None] * np.column_stack([moving, ~moving])
-            first, last = windows(drive.motion, _SHORT_WINDOW_S)
+            moving = np.abs(drive.speed) > _MOVING
+            values = drive.turn_rate[:, None] * np.column_stack([moving, ~moving])
+            first, last = windows(drive, _SHORT_WINDOW_S)
             integral = gathered(values, drive, Lateness(delay_s, lag_s))
-            basis, turn = integral[last] - integral[first], drive.motion.turn
-            wanted = turn[last] - turn[first]
+            basis, wanted = integral[last] - integral[first], drive.turn[last] - drive.turn[first]
             share = ridge(basis, wanted, 1e-9 * np.eye(2), np.ones(2), rounds=2)
             total += float(np.sum(np.abs(wanted - basis @ share)))  # not squared: slip is no delay
         return total
@@ -227,9 +209,10 @@ def _grid(drives: Sequence[Drive], count: int) -> tuple[FloatArray, FloatArray]:
     """Speeds and turn rates of a grid with `count` points above 0; 0: one scale factor."""
     if not count:
         return np.zeros(1), np.zeros(1)
-    speed = np.concatenate([np.abs(drive.steps.speed) for drive in drives])
-    turn_rate = np.concatenate([np.abs(drive.steps.turn_rate) for drive in drives])
-    duration_s = np.concatenate([drive.steps.duration_s for drive in drives])
+    speed, turn_rate, duration_s = (
+        np.concatenate([np.abs(getattr(drive, name)) for drive in drives])
+        for name in ("speed", "turn_rate", "duration_s")
+    )
     driving = speed > _MOVING
     return nodes_of(speed, duration_s, count), nodes_of(turn_rate[driving], duration_s[driving], count)
 
@@ -270,17 +253,16 @@ def _regression(
     """The regression of all windows, of the path (column 0) or the turn (column 1)."""
     bases, targets, borders = [], [], []
     for drive in drives:
-        steps, motion = drive.steps, drive.motion
         weight = (
-            hats(np.abs(steps.speed), speeds)[:, :, None] * hats(np.abs(steps.turn_rate), turn_rates)[:, None]
+            hats(np.abs(drive.speed), speeds)[:, :, None] * hats(np.abs(drive.turn_rate), turn_rates)[:, None]
         )
-        reported = steps.turn_rate if column else steps.speed
+        reported = drive.turn_rate if column else drive.speed
         values = weight.reshape(reported.size, -1) * reported[:, None]
         integral = gathered(values, drive, late)
-        true = motion.path
+        true = drive.path
         if column:
-            true = motion.turn - gathered(steps.turn_bias[:, None], drive, late)[:, 0]
-        first, last = windows(motion, WINDOW_S)
+            true = drive.turn - gathered(drive.turn_bias[:, None], drive, late)[:, 0]
+        first, last = windows(drive, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
         # each block holds windows, whichever part of the time has ground truth
@@ -301,15 +283,9 @@ def _prior(speeds: int, turn_rates: int) -> FloatArray:
     """Information (V W, V W) of the priors on scale factors."""
     size = speeds * turn_rates
     index = np.arange(size).reshape(speeds, turn_rates)
-    pairs = np.concatenate(
-        [
-            np.column_stack([index[:-1].ravel(), index[1:].ravel()]),
-            np.column_stack([index[:, :-1].ravel(), index[:, 1:].ravel()]),
-        ]
-    )
-    difference = np.zeros((len(pairs), size))
-    difference[np.arange(len(pairs)), pairs[:, 0]] = 1.0
-    difference[np.arange(len(pairs)), pairs[:, 1]] = -1.0
+    before = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
+    after = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
+    difference = np.eye(size)[before] - np.eye(size)[after]
     information: FloatArray = (_SMOOTHNESS * difference.T @ difference + _TO_ONE * np.eye(size)) / size
     return information
 
@@ -318,16 +294,15 @@ def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse 
     """Errors (m, 2) of path [m] and turn [rad] of 5 s windows."""
     errors = []
     for drive in drives:
-        steps, motion = drive.steps, drive.motion
-        reported = np.column_stack([steps.speed, steps.turn_rate])
+        reported = np.column_stack([drive.speed, drive.turn_rate])
         if response is not None:
-            speed = hats(np.abs(steps.speed), np.array(response.speeds))
-            turn_rate = hats(np.abs(steps.turn_rate), np.array(response.turn_rates))
+            speed = hats(np.abs(drive.speed), np.array(response.speeds))
+            turn_rate = hats(np.abs(drive.turn_rate), np.array(response.turn_rates))
             for column, table in enumerate((response.speed_share, response.turn_share)):
                 reported[:, column] *= np.einsum("nv,vw,nw->n", speed, np.array(table), turn_rate)
-            reported[:, 1] += steps.turn_bias
+            reported[:, 1] += drive.turn_bias
         integral = gathered(reported, drive, late)
-        first, last = windows(motion, WINDOW_S)
-        true = np.column_stack([motion.path, motion.turn])
+        first, last = windows(drive, WINDOW_S)
+        true = np.column_stack([drive.path, drive.turn])
         errors.append((true[last] - true[first]) - (integral[last] - integral[first]))
     return np.concatenate(errors)

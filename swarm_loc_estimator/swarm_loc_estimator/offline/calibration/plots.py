@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import curve_at
-from swarm_loc_estimator.offline.calibration.camera import CameraFit
 from swarm_loc_estimator.offline.calibration.fit import Calibration
 from swarm_loc_estimator.offline.calibration.infrared.board import BLOCKS, BoardCalibration, BoardRecording
 from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts
 from swarm_loc_estimator.offline.calibration.infrared.gains import BoardFit, InfraredCalibration, rms
-from swarm_loc_estimator.offline.calibration.robust import spread
-from swarm_loc_estimator.offline.report.plots import INK, SOFT, TRUTH, colour_of, save, style
+from swarm_loc_estimator.offline.calibration.models import DriveFit
+from swarm_loc_estimator.offline.calibration.sightings import CameraFit, spread
+from swarm_loc_estimator.offline.report.plots import SOFT, TRUTH, colour_of, save, style
 from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.ir_board import AngleCurve
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -34,18 +34,12 @@ def text_of(done: Calibration) -> str:
     """The residuals before and after, the fitted noise and the remarks."""
     lines = [f"{'':34}{'before':>10}{'after':>10}"]
     for fit in done.models.cameras:
-        errors = _sighting_errors([fit] if fit.is_enough else [])
-        lines += [
-            _line(f"{fit.robot.name} {label}", spread(before), spread(after))
-            for label, before, after in errors
-        ]
+        for label, before, after in _sighting_errors([fit] if fit.is_enough else []):
+            lines.append(_line(f"{fit.robot.name} {label}", spread(before), spread(after)))
     for motion in done.models.motion:
-        lines += [
-            _line(f"motion over 5 s, {label}", spread(motion.before[:, k]), spread(motion.after[:, k]))
-            for k, label in enumerate(_MOTION_LABELS)
-        ]
-        late = motion.late
-        lines.append(f"delay {late.delay_s:.3f} s, lag {late.lag_s:.3f} s")
+        for label, before, after in _motion_errors([motion]):
+            lines.append(_line(label, spread(before), spread(after)))
+        lines.append(f"delay {motion.late.delay_s:.3f} s, lag {motion.late.lag_s:.3f} s")
     if done.before is not None and done.after is not None:
         degrees = [math.degrees(one.heading_rmse) for one in (done.before, done.after)]
         lines += [
@@ -61,7 +55,9 @@ def draw(done: Calibration, path: Path) -> Path:
     """Plot residuals before and after, and the table of scale factors; returns the file."""
     responses = [motion.response for motion in done.models.motion if motion.response is not None]
     response = responses[0] if responses and len(responses[0].speeds) > 1 else None
-    panels = _panels(done)
+    seen = _sighting_errors(done.models.cameras)
+    panels = [(f"sightings, {label}", before, after) for label, before, after in seen]
+    panels += _motion_errors(done.models.motion)
     count = len(panels) + 2 * (response is not None)
     columns = min(_COLUMNS, max(1, count))
     rows = -(-count // columns)
@@ -99,42 +95,34 @@ def _line(name: str, before: float, after: float) -> str:
     return f"{name:34}{before:10.3g}{after:10.3g}"
 
 
-def _panels(done: Calibration) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Label, errors before and errors after of everything that was fitted."""
-    errors = _sighting_errors(done.models.cameras)
-    panels = [(f"sightings, {label}", before, after) for label, before, after in errors]
-    for k, label in enumerate(_MOTION_LABELS if done.models.motion else ()):
+def _motion_errors(fits: Sequence[DriveFit]) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Label, errors before and errors after of the motion of some types."""
+    for k, label in enumerate(_MOTION_LABELS if fits else ()):
         before, after = (
-            np.concatenate([getattr(fit, name)[:, k] for fit in done.models.motion])
-            for name in ("before", "after")
+            np.concatenate([getattr(fit, name)[:, k] for fit in fits]) for name in ("before", "after")
         )
-        panels.append((f"motion over 5 s, {label}", before, after))
-    return panels
+        yield f"motion over 5 s, {label}", before, after
 
 
 def _histogram(axis: Any, title: str, before: FloatArray, after: FloatArray, bins: FloatArray) -> None:
-    """Histograms of the errors before and after."""
-    style(axis)
+    style(axis, title)
     axis.hist(before, bins, color=TRUTH, alpha=0.6, label="before")
     axis.hist(after, bins, histtype="step", color=colour_of(0), linewidth=1.6, label="after")
-    _title(axis, title)
     axis.set_yticks([])
     axis.spines["left"].set_visible(False)
 
 
 def _shares(axis: Any, response: MotionResponse, name: str) -> None:
-    """A coloured table of scale factors."""
+    style(axis, f"true share of reported {name}", "turn rate [rad/s]", "speed [m/s]")
+    axis.grid(visible=False)
     table = np.array(response.speed_share if name == "speed" else response.turn_share)
     axis.imshow(table, cmap="coolwarm", vmin=0.4, vmax=1.6, aspect="auto", origin="lower")
     for (row, column), share in np.ndenumerate(table):
         axis.text(column, row, f"{share:.2f}", ha="center", va="center", fontsize=8)
     axis.set_xticks(range(len(response.turn_rates)), [f"{v:.2f}" for v in response.turn_rates])
     axis.set_yticks(range(len(response.speeds)), [f"{v:.3f}" for v in response.speeds])
-    axis.tick_params(colors=SOFT, labelsize=8, length=0)
+    axis.tick_params(length=0)
     axis.spines[:].set_visible(False)
-    _title(axis, f"true share of reported {name}")
-    axis.set_xlabel("turn rate [rad/s]", color=SOFT, fontsize=9)
-    axis.set_ylabel("speed [m/s]", color=SOFT, fontsize=9)
 
 
 _REACH = 6.0
@@ -226,7 +214,7 @@ def draw_gains(done: InfraredCalibration, path: Path) -> Path:
 def _by_brightness(axis: Any, board: BoardFit) -> None:
     """Residuals by brightness: wrong gains show in bright readings, blocked light in dark ones."""
     readings = board.group.exchanges.readings
-    style(axis)
+    style(axis, "rms residual by brightness [sigma]", "reading [count]")
     for label, residuals, colour in (
         ("before", board.fit.before, TRUTH),
         ("after", board.fit.after, colour_of(0)),
@@ -245,8 +233,6 @@ def _by_brightness(axis: Any, board: BoardFit) -> None:
         axis.axvline(ceiling, color=SOFT, linewidth=0.3)
     axis.axhline(1.0, color=SOFT, linewidth=0.8, linestyle="--")
     axis.set_ylim(bottom=0.0)
-    axis.set_xlabel("reading [count]", color=SOFT, fontsize=9)
-    _title(axis, "rms residual by brightness [sigma]")
 
 
 def _sizes(readings: FloatArray, residuals: FloatArray) -> tuple[list[float], list[float]]:
@@ -261,8 +247,7 @@ def _sizes(readings: FloatArray, residuals: FloatArray) -> tuple[list[float], li
 
 
 def _gains(axis: Any, board: BoardFit, names: list[str]) -> None:
-    """Gains of each robot's elements with standard deviations."""
-    style(axis)
+    style(axis, "gains, one sigma")
     for number, part in enumerate(("sensor", "emitter")):
         factors = np.array([getattr(gains, part) for gains in board.fit.gains])
         sigma = np.array([np.hypot(gains.sigma, gains.common_sigma) for gains in board.fit.gains])
@@ -280,11 +265,6 @@ def _gains(axis: Any, board: BoardFit, names: list[str]) -> None:
     axis.axhline(1.0, color=SOFT, linewidth=0.8, linestyle="--")
     axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 4 else 0)
     axis.legend(frameon=False, fontsize=9, ncols=2)
-    _title(axis, "gains, one sigma")
-
-
-def _title(axis: Any, text: str) -> None:
-    axis.set_title(text, loc="left", fontsize=10, color=INK)
 
 
 _CHI_SQUARE_99 = 11.345
@@ -327,13 +307,12 @@ def draw_board(board: BoardRecording, done: BoardCalibration, path: Path) -> Pat
     axes: list[Any] = list(figure.subplots(1, 2))
     for side, name in enumerate(("sensor", "emitter")):
         new, old = (_values(getattr(one, name)) for one in (done.model.platform, board.platform))
-        style(axes[side])
+        style(axes[side], x=f"angle at the {name} [deg]")
         angles, values = _scatter(done, side, new)
         axes[side].plot(angles, values, ".", color=SOFT, markersize=2, alpha=0.3)
         axes[side].plot(_DEGREES, old, color=TRUTH, linestyle="--", label="before")
         axes[side].plot(_DEGREES, new, color=colour_of(side), label="fitted")
         axes[side].set_ylim(0.0, 2.0)
-        axes[side].set_xlabel(f"angle at the {name} [deg]", color=SOFT, fontsize=9)
         axes[side].legend(frameon=False, fontsize=9)
     save(figure, path)
     return path

@@ -33,6 +33,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 _INPUTS = ("odometry", "detections", "brightness", "fixes", "turn_rates", "ranges")
+DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
 _PAUSE_NS = 60_000_000_000  # Between recordings, in which robots may get anywhere
 
 
@@ -54,6 +55,7 @@ class Recording:
     ranges: RangeRows = NO_RANGES  # Of all UWB radios, as they arrived
     dropped: Mapping[str, int] = field(default_factory=dict)  # Number of dropped inputs by reason
     remarks: tuple[str, ...] = ()  # Unreadable contents, one sentence each
+    bags_ns: tuple[tuple[int, int], ...] = ()  # First and last arrival of each of several joined bags
 
     def sentences(self, expected: Collection[str] = ()) -> list[str]:
         """The remarks, and what was dropped for other reasons than the expected ones."""
@@ -84,13 +86,19 @@ class Recording:
         )
         return max(int(np.diff(np.sort(column)).max(initial=0)) for column in times)
 
-    def between(self, from_ns: int, to_ns: int) -> Recording:
-        """The recording with only the inputs that arrived in [from_ns, to_ns)."""
-        parts = {
-            name: select(rows, (rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns))
-            for name, rows in self.inputs.items()
-        }
+    def between(self, *spans_ns: tuple[int, int]) -> Recording:
+        """The recording with only the inputs that arrived in one of the spans [from, to)."""
+        parts = {}
+        for name, rows in self.inputs.items():
+            arrived = [(rows.arrival_ns >= first) & (rows.arrival_ns < last) for first, last in spans_ns]
+            parts[name] = select(rows, np.any(arrived, axis=0))
         return replace(self, **parts)
+
+    @property
+    def halves_ns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """The first half [from, to) of each bag, and the second."""
+        ends = [(a, (a + b) // 2, b + 1) for a, b in self.bags_ns or (self.range_ns,)]
+        return [(begin, middle) for begin, middle, _ in ends], [(middle, end) for _, middle, end in ends]
 
     @property
     def messages(self) -> Batch:
@@ -126,20 +134,25 @@ def read_recording(
     parts: list[Batch] = []
     summary = read_bag(bag, swarm, parts.append, progress, remap)
     tracks = {**summary.truth, **truth}
+    known = {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in tracks.items()}
+    return replace(recording_of(bag.name, parts, swarm), truth=known, remarks=summary.remarks)
+
+
+def recording_of(name: str, parts: Sequence[Batch], swarm: Swarm) -> Recording:
+    """The recording of inputs as they came."""
     converter = InputConverter(swarm, Settings())
     moved = [converter.convert(part) for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
     return Recording(
-        bag.name,
+        name,
         gathered(moved, "odometry"),
         concatenate(detections or [NO_DETECTIONS]),
-        {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in tracks.items()},
+        {},
         gathered(parts, "brightness"),
         gathered(parts, "fixes"),
         gathered(moved, "imu"),
         gathered(parts, "ranges"),
         converter.drops.total,
-        summary.remarks,
     )
 
 
@@ -149,8 +162,10 @@ def joined(recordings: Sequence[Recording]) -> Recording:
     Nobody knows how robots moved in the pauses between them.
     """
     whole, *others = recordings
+    bags_ns = [whole.range_ns]
     for other in others:
         later_ns = whole.range_ns[1] + _PAUSE_NS - other.range_ns[0]
+        bags_ns.append((other.range_ns[0] + later_ns, other.range_ns[1] + later_ns))
         parts = {}
         for name, rows in other.inputs.items():
             late = rows._replace(stamp_ns=rows.stamp_ns + later_ns, arrival_ns=rows.arrival_ns + later_ns)
@@ -163,7 +178,7 @@ def joined(recordings: Sequence[Recording]) -> Recording:
         dropped = Counter(whole.dropped) + Counter(other.dropped)
         name, remarks = f"{whole.name}, {other.name}", whole.remarks + other.remarks
         whole = Recording(name=name, truth=truth, dropped=dropped, remarks=remarks, **parts)
-    return whole
+    return replace(whole, bags_ns=tuple(bags_ns))
 
 
 def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:

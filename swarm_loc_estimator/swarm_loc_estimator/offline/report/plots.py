@@ -51,8 +51,11 @@ def seconds_since(begin_ns: int, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray
     return (stamp_ns - begin_ns).astype(np.float64) * 1e-9
 
 
-def style(axis: Axes) -> None:
-    """Format axes: light grid, no frame."""
+def style(axis: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """Format axes: light grid, no frame, a title to the left, labels."""
+    axis.set_title(title, loc="left", fontsize=10, color=INK)
+    axis.set_xlabel(x, color=SOFT, fontsize=9)
+    axis.set_ylabel(y, color=SOFT, fontsize=9)
     axis.grid(visible=True, color="#e4e8ec", linewidth=0.6)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
@@ -100,7 +103,6 @@ def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
 
 
 def _place(figure: Figure, margins: Margins) -> None:
-    """Place the axes of a figure."""
     width, height = figure.get_size_inches()
     grid: Any = figure.axes[0].get_gridspec()
     left, right, bottom, top, across, down = margins
@@ -146,9 +148,9 @@ class WorldMap:
         """Height over width."""
         return (self.y[1] - self.y[0]) / self.width
 
-    def draw_world(self, axis: Axes) -> None:
+    def draw_world(self, axis: Axes, title: str = "", x: str = "", y: str = "") -> None:
         """Draw axes at equal scale, and the landmarks."""
-        style(axis)
+        style(axis, title, x, y)
         axis.set(aspect="equal", xlim=self.x, ylim=self.y)
         for mark in self._result.swarm.landmarks:
             self._draw_landmark(axis, mark)
@@ -199,12 +201,8 @@ def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray]
     return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
 
 
-def label_map(axis: Axes) -> None:
-    """Label the axes."""
-    axis.set_xlabel("x in map [m]", color=SOFT, fontsize=9)
-    axis.set_ylabel("y in map [m]", color=SOFT, fontsize=9)
-
-
+IN_MAP = "x in map [m]", "y in map [m]"
+"""Labels of axes."""
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6  # Height of title, legend and axes
 _AROUND_MAP = Margins(left=0.65, right=0.15, bottom=0.9, top=0.7, across=0.5, down=0.6)
@@ -245,7 +243,6 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
 
 
 def _title(result: ReplayResult) -> str:
-    """Sizes and pooled errors."""
     robots = f"{_counted(result.swarm.robots, 'robot')}, {_counted(result.swarm.landmarks, 'landmark')}"
     if not result.errors:
         return robots
@@ -263,8 +260,7 @@ def _counted(things: tuple[object, ...], name: str) -> str:
 
 def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
     """Draw landmarks, truth, paths and robots; returns the factor by which ellipses are enlarged."""
-    world.draw_world(axis)
-    label_map(axis)
+    world.draw_world(axis, "", *IN_MAP)
     ends = [last_pose(result, index) for index in range(len(result.swarm.robots))]
     sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for _, one in filter(None, ends)]
     is_seen = not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * world.width
@@ -278,21 +274,20 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
         if end is None:
             continue
         pose, covariance = end
-        _draw_ellipse(axis, pose, covariance[:2, :2], enlarged, colour_of(index))
+        draw_ellipse(axis, pose, covariance, enlarged, colour_of(index))
         world.draw_robot(axis, index, pose)
         if len(ends) <= _MAX_NAMES:
             _draw_name(axis, result.swarm.robots[index].name, pose, middle, colour_of(index))
     return enlarged
 
 
-def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
-    """Draw the covariance (2, 2) of a position."""
-    variances, directions = np.linalg.eigh(covariance)
+def draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
+    """Draw the 3-sigma ellipse of a position by the covariance (3, 3) of a pose (3,)."""
+    variances, directions = np.linalg.eigh(covariance[:2, :2])
     minor, major = 2.0 * _SIGMAS * enlarged * np.sqrt(variances.clip(min=0.0))
     turn = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
-    shape = Ellipse((float(pose[0]), float(pose[1])), major, minor, angle=turn, alpha=0.28, zorder=5)
-    shape.set_color(colour)
-    axis.add_patch(shape)
+    place = float(pose[0]), float(pose[1])
+    axis.add_patch(Ellipse(place, major, minor, angle=turn, alpha=0.28, zorder=5, color=colour))
 
 
 def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colour: str) -> None:
@@ -315,7 +310,6 @@ def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colo
 
 
 def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
-    """Draw the legend."""
     larger = f", {enlarged:.0f} x enlarged" if enlarged != 1.0 else ""
     meanings = [
         Line2D([], [], color=INK, linewidth=3.5, label="landmark"),
@@ -330,7 +324,7 @@ def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
 
 def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], result: ReplayResult) -> None:
     """Plot an error over time: thin for each robot, bold for the RMS of the swarm."""
-    style(axis)
+    style(axis, f"{title}, bold: RMS")
     begin_ns = int(result.stamp_ns[0])
     for name, errors in result.errors.items():
         line = np.column_stack([seconds_since(begin_ns, errors.stamp_ns), of(errors)])
@@ -341,14 +335,12 @@ def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], res
     known = np.isfinite(off)  # a heading may be unknown
     if known.any():
         axis.plot(*_rms(seconds_since(begin_ns, every.stamp_ns[known]), off[known]), color=INK, linewidth=1.8)
-    axis.set_title(f"{title}, bold: RMS", loc="left", fontsize=10, color=INK)
     axis.set(xmargin=0.0, ylim=(0.0, max(1.3 * _most(off), 1e-3)))
 
 
 def _most(off: FloatArray) -> float:
     """The 99th percentile of the errors that are known; 0 without any."""
-    known = off[np.isfinite(off)]
-    return float(np.percentile(known, 99.0)) if len(known) else 0.0
+    return float(np.nanpercentile(off, 99.0)) if np.isfinite(off).any() else 0.0
 
 
 def _rms(time_s: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -383,17 +375,15 @@ def plot_paths(result: ReplayResult, path: Path) -> bool:
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for index, robot in enumerate(robots):
         axis = axes[index]
-        world.draw_world(axis)
+        world.draw_world(axis, robot.name, *(IN_MAP if index == (rows - 1) * columns else ()))
+        axis.title.set(color=colour_of(index), fontweight="bold")
         world.draw_ids(axis)
         world.draw_paths(axis, index, alpha=0.9)
-        end = last_pose(result, index)
-        if end is not None:
+        if (end := last_pose(result, index)) is not None:
             world.draw_robot(axis, index, end[0])
-        axis.set_title(robot.name, loc="left", fontsize=10, color=colour_of(index), fontweight="bold")
     for place in range(len(robots), len(axes)):
         axes[place].set_visible(False)
         axes[place - columns].tick_params(labelbottom=True)
-    label_map(axes[(rows - 1) * columns])
     save(figure, path, _AROUND_PATHS)
     return True
 
@@ -413,11 +403,12 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     limits = _error_limits([result.errors[name] for name in shown])
     _, unit = length_unit(limits[0])
     for row, name in enumerate(shown):
-        colour = colour_of(result.swarm.index_of[name])
-        _draw_errors_of(axes[row, :3], result.errors[name], colour, int(result.stamp_ns[0]), limits)
+        colour, begin_ns = colour_of(result.swarm.index_of[name]), int(result.stamp_ns[0])
+        _draw_errors_of(axes[row, :3], result.errors[name], colour, begin_ns, limits)
         if result.smoothed is not None:
-            _draw_smoothed(axes[row, :3], result.smoothed.errors[name], int(result.stamp_ns[0]), limits)
-        _draw_nees(axes[row, 3], result.errors[name], colour, int(result.stamp_ns[0]))
+            smoothed = result.smoothed.errors[name]
+            _draw_errors_of(axes[row, :3], smoothed, INK, begin_ns, limits, is_above=True)
+        _draw_nees(axes[row, 3], result.errors[name], colour, begin_ns)
         axes[row, 0].set_ylabel(name, color=colour, fontweight="bold")
     titles = (f"x error [{unit}]", f"y error [{unit}]", "heading error [deg]", "NEES")
     for axis, title in zip(axes[0], titles, strict=True):
@@ -442,40 +433,34 @@ def _error_limits(errors: list[Errors]) -> tuple[float, float]:
 
 
 def _draw_errors_of(
-    axes: npt.NDArray[np.object_], errors: Errors, colour: str, begin_ns: int, limits: tuple[float, float]
+    axes: npt.NDArray[np.object_],
+    errors: Errors,
+    colour: str,
+    begin_ns: int,
+    limits: tuple[float, float],
+    *,
+    is_above: bool = False,
 ) -> None:
-    """Plot one robot's errors in x, y and heading with 3-sigma bands."""
+    """Plot one robot's errors in x, y and heading: with 3-sigma bands, or as lines above what is drawn."""
     rows = _thin(errors)
     time_s = seconds_since(begin_ns, errors.stamp_ns[rows])
     metre, _ = length_unit(limits[0])
-    scales = (metre, metre, math.degrees(1.0))
-    for column, (axis, scale) in enumerate(zip(axes, scales, strict=True)):
-        style(axis)
+    for column, (axis, scale) in enumerate(zip(axes, (metre, metre, math.degrees(1.0)), strict=True)):
         value, sigma = (scale * part[rows, column] for part in (errors.error, errors.sigma))
-        axis.fill_between(time_s, -3.0 * sigma, 3.0 * sigma, color=colour, alpha=0.16, linewidth=0)
         line = broken(errors.stamp_ns[rows], np.column_stack([time_s, value]))
         lone = len(line) > len(rows)  # single points between gaps make no line
         axis.plot(*line.T, color=colour, linewidth=0.7, marker="." if lone else "", markersize=3)
+        if is_above:
+            continue
+        style(axis)
+        axis.fill_between(time_s, -3.0 * sigma, 3.0 * sigma, color=colour, alpha=0.16, linewidth=0)
         axis.axhline(0.0, color=SOFT, linewidth=0.5)
         limit = scale * limits[column == 2]
         axis.set_ylim(-limit, limit)
         axis.locator_params(axis="y", nbins=5)
 
 
-def _draw_smoothed(
-    axes: npt.NDArray[np.object_], errors: Errors, begin_ns: int, limits: tuple[float, float]
-) -> None:
-    """Plot one robot's smoothed errors in x, y and heading over those of its online poses."""
-    rows = _thin(errors)
-    time_s, metre = seconds_since(begin_ns, errors.stamp_ns[rows]), length_unit(limits[0])[0]
-    for column, (axis, scale) in enumerate(zip(axes, (metre, metre, math.degrees(1.0)), strict=True)):
-        value = scale * errors.error[rows, column]
-        line = broken(errors.stamp_ns[rows], np.column_stack([time_s, value]))
-        axis.plot(*line.T, color=INK, linewidth=0.7)
-
-
 def _draw_nees(axis: Axes, errors: Errors, colour: str, begin_ns: int) -> None:
-    """Plot one robot's normalized squared errors."""
     rows = _thin(errors)
     time_s = seconds_since(begin_ns, errors.stamp_ns[rows])
     style(axis)
@@ -492,7 +477,5 @@ def _thin(errors: Errors) -> npt.NDArray[np.intp]:
     count = len(errors.stamp_ns)
     if count <= _MAX_POINTS:
         return np.arange(count)
-    size = math.ceil(count / _MAX_POINTS)
-    starts = range(0, count, size)
-    position = errors.position
-    return np.array([start + int(np.argmax(position[start : start + size])) for start in starts])
+    size, position = math.ceil(count / _MAX_POINTS), errors.position
+    return np.array([k + int(np.argmax(position[k : k + size])) for k in range(0, count, size)])

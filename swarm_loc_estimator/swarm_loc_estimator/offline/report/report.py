@@ -181,19 +181,19 @@ def facts(result: ReplayResult) -> dict[str, str]:
     return rows
 
 
+_WITHOUT_TRUTH = "No ground truth to compare with."
+_SELF_CALIBRATION = "Self-calibration, with one standard deviation"
+
+
 def text_report(result: ReplayResult) -> str:
     """The whole report as text."""
     lines = [result.title, "=" * len(result.title), ""]
     lines += _pairs(facts(result))
-    if result.errors:
-        lines += ["", *_errors(result).text()]
-    else:
-        lines += ["", "No ground truth to compare with."]
-    robots = self_calibrated_robots(result)
-    if robots:
-        lines += ["", "Self-calibration, with one standard deviation"]
-        lines += Table(robots, SELF_CALIBRATED).text()
-    lines += ["", self_calibrated_landmarks(result)] if self_calibrated_landmarks(result) else []
+    lines += ["", *(_errors(result).text() if result.errors else [_WITHOUT_TRUTH])]
+    if robots := self_calibrated_robots(result):
+        lines += ["", _SELF_CALIBRATION, *Table(robots, SELF_CALIBRATED).text()]
+    if marks := self_calibrated_landmarks(result):
+        lines += ["", marks]
     if result.counters:
         lines += ["", "Counters", *_pairs(result.counters)]
     if result.remarks:
@@ -202,14 +202,10 @@ def text_report(result: ReplayResult) -> str:
 
 
 def _number(value: float, digits: int) -> str:
-    """A number, or a dash for NaN."""
-    if math.isnan(value):
-        return "-"
-    return f"{value:.{digits}f}"
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _pairs(rows: Mapping[str, object]) -> list[str]:
-    """One line per name and value."""
     width = max(map(len, rows), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in rows.items()]
 
@@ -290,7 +286,7 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         _facts(result),
         remarks and f"<h2>Remarks</h2><ul>{remarks}</ul>",
         "<h2>Errors against ground truth</h2>"
-        + (_errors(result).html() if result.errors else "<p>No ground truth to compare with.</p>"),
+        + (_errors(result).html() if result.errors else f"<p>{_WITHOUT_TRUTH}</p>"),
         run and f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{escape(page(run))}"></iframe>',
         *(picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
@@ -310,17 +306,11 @@ def page_of(title: str, parts: Sequence[str]) -> str:
 
 
 def _facts(result: ReplayResult) -> str:
-    """Pooled errors, sizes, durations and speed."""
-    rows = summaries(result)
-    headline = []
-    if rows:
+    cards = [("", *one) for one in facts(result).items()]
+    if rows := summaries(result):
         figures = cells(*rows[-1])
-        headline = [
-            ("position RMSE", f"{figures[2]} m"),
-            ("heading RMSE", f"{figures[7]}°"),
-            ("NEES", figures[12]),
-        ]
-    cards = [("headline", *one) for one in headline] + [("", *one) for one in facts(result).items()]
+        pooled = {"position RMSE": f"{figures[2]} m", "heading RMSE": f"{figures[7]}°", "NEES": figures[12]}
+        cards = [*(("headline", *one) for one in pooled.items()), *cards]
     shown = "".join(
         f'<div class="{kind}"><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>'
         for kind, name, text in cards
@@ -329,12 +319,9 @@ def _facts(result: ReplayResult) -> str:
 
 
 def _self_calibration(result: ReplayResult) -> str:
-    """The table of estimated calibration parameters."""
     rows, sentence = self_calibrated_robots(result), self_calibrated_landmarks(result)
-    if not rows and not sentence:
-        return ""
     table = Table(rows, SELF_CALIBRATED).html() if rows else ""
-    return f"<h2>Self-calibration, with one standard deviation</h2>{table}<p>{escape(sentence)}</p>"
+    return f"<h2>{_SELF_CALIBRATION}</h2>{table}<p>{escape(sentence)}</p>" if rows or sentence else ""
 
 
 def picture(heading: str, path: Path) -> str:

@@ -19,19 +19,23 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.offline.batch.parameters import SURVEY, all_changed
-from swarm_loc_estimator.offline.batch.problem import MIN_SIGHTINGS, BatchProblem, problem_of
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
-from swarm_loc_estimator.offline.batch.start import Start, start_of
+from swarm_loc_estimator.offline.batch.problem import (
+    MIN_SIGHTINGS,
+    SURVEY,
+    BatchProblem,
+    all_changed,
+    corrections,
+    problem_of,
+)
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, Start, start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
-from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
+from swarm_loc_estimator.offline.report.plots import IN_MAP, INK, SOFT, colour_of, draw_ellipse, save, style
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.swarm.calibration_states import shared_error
 from swarm_loc_estimator.swarm.swarm import (
@@ -83,29 +87,27 @@ def place_fixed(recording: Recording, swarm: Swarm, paths: Paths, *, cameras: bo
     return _with_anchors(placed, recording, swarm, paths) if recording.ranges.robot.size else placed
 
 
+_AMBIGUOUS = (
+    ", since other places fit as well: it has seen robots on one line or at few places only; let them drive"
+    " over the whole floor."
+)
+
+
 def _with_cameras(placed: Placed, recording: Recording, swarm: Swarm, paths: Paths) -> Placed:
     """All fixed cameras, located by markers on robots."""
     found, lines = [], ["camera              x [m]     y [m]   z [m]  yaw [deg]  sigma [mm]  contradicting"]
     remarks = []
     for index, camera in enumerate(swarm.cameras, len(swarm.robots)):
         optical, place, stamp_ns = _sighted(recording, swarm, index, camera, paths)
-        if stamp_ns.size < MIN_MEASUREMENTS:
-            found.append(camera)
-            remarks.append(
-                f"Camera {camera.name} stays as it is described: it has seen robots whose paths are known"
-                f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
-            )
-            continue
-        fit = _located(camera, optical, place, stamp_ns)
-        if fit is None:
-            found.append(camera)
-            remarks.append(
-                f"Camera {camera.name} stays as it is described, since other places fit as well: it has seen"
-                " robots on one line or at few places only; let them drive over the whole floor."
-            )
-            continue
-        located, wrong = fit
+        is_rare = stamp_ns.size < MIN_MEASUREMENTS
+        fit = None if is_rare else _located(camera, optical, place, stamp_ns)
+        located, wrong = fit or (camera, 0.0)
         found.append(located)
+        if fit is None:
+            why = ": it has seen robots whose paths are known"
+            why += f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
+            remarks.append(f"Camera {camera.name} stays as it is described{why if is_rare else _AMBIGUOUS}")
+            continue
         sigma, yaw = 1e3 * located.position_sigma, math.degrees(located.yaw)
         numbers = (
             f"{located.x:9.3f} {located.y:9.3f} {located.z:7.3f} {yaw:10.1f} {sigma:11.1f} {wrong:14.0%}"
@@ -173,16 +175,15 @@ def _located(
     # the pose as a description states it
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
-        yaw, pitch, roll = Rotation.from_matrix(rotation.as_matrix() @ FROM_OPTICAL.T).as_euler("ZYX")
-    x, y, z = (round(float(value), 5) for value in pose[3:])
-    yaw, pitch, roll = (round(float(angle), 6) for angle in (yaw, pitch, roll))
+        angles = Rotation.from_matrix(rotation.as_matrix() @ FROM_OPTICAL.T).as_euler("ZYX")
+    x, y, z = np.round(pose[3:], 5).tolist()
+    yaw, pitch, roll = np.round(angles, 6).tolist()
     position_sigma = max(math.sqrt(0.5 * float(spread[0] + spread[1])), _LEAST_SIGMA)
     yaw_sigma = max(math.sqrt(float(spread[2])), _LEAST_SIGMA)
     if position_sigma > _MOST_SIGMA or yaw_sigma > _MOST_YAW_SIGMA:
         return None
-    return FixedCamera(
-        camera.name, x, y, z, yaw, pitch, roll, position_sigma, yaw_sigma, camera.sensor
-    ), wrong
+    found = FixedCamera(camera.name, x, y, z, yaw, pitch, roll, position_sigma, yaw_sigma, camera.sensor)
+    return found, wrong
 
 
 def _aligned(points: FloatArray, to: FloatArray) -> FloatArray:
@@ -208,12 +209,9 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
     pose = paths(rows.robot, rows.stamp_ns)
     usable &= np.isfinite(pose).all(axis=1) & np.isfinite(rows.range)
     devices = [one or UwbDevice(0) for one in radios]
-    antenna = np.array([(one.x, one.y, one.z) for one in devices])[rows.robot]
-    at = np.column_stack([se2.transform_points(pose, antenna[:, :2]), antenna[:, 2]])
-    bias, scale = (
-        np.array([getattr(one, name) for one in devices])[rows.robot]
-        for name in ("range_bias", "range_scale")
-    )
+    of_radio = np.array([(one.x, one.y, one.z, one.range_bias, one.range_scale) for one in devices])
+    *antenna, bias, scale = of_radio[rows.robot].T
+    at = np.column_stack([se2.transform_points(pose, np.column_stack(antenna[:2])), antenna[2]])
     measured = (rows.range - bias) / scale
     # one anchor after the other
     found, remarks = [*placed.anchors], [*placed.remarks]
@@ -224,8 +222,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
         if own.sum() < MIN_MEASUREMENTS:
             remarks.append(f"{name} was measured {own.sum()} x only and is left out; drive near it.")
             continue
-        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own])
-        if fit is None:
+        if (fit := _multilaterated(at[own], measured[own], rows.stamp_ns[own])) is None:
             remarks.append(
                 f"{name} is left out, since other places fit as well: it was measured from one line or few"
                 " places only, or its ranges contradict each other; drive over the whole floor."
@@ -297,7 +294,6 @@ def _robust(residual: Residual, start: FloatArray, count: int) -> tuple[FloatArr
 
 
 def _fitted(residual: Residual, start: FloatArray, sigma: float, rows: BoolArray) -> FloatArray:
-    """Parameters (p,) that fit some rows best."""
 
     def whitened(parameters: FloatArray) -> FloatArray:
         return residual(parameters, rows).ravel() / sigma
@@ -464,10 +460,9 @@ def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) ->
             found.append(mark)
         elif np.isfinite(pose).all():
             x, y, yaw = pose
-            position_sigma, yaw_sigma = math.sqrt(0.5 * float(own[0] + own[1])), math.sqrt(float(own[2]))
+            placed = replace(mark, x=x, y=y, position_sigma=math.sqrt(0.5 * float(own[0] + own[1])))
             has_yaw = mark.yaw is not None
-            place = {"x": x, "y": y, "yaw": yaw if has_yaw else None, "position_sigma": position_sigma}
-            found.append(replace(mark, **place, yaw_sigma=yaw_sigma if has_yaw else 0.0))
+            found.append(replace(placed, yaw=yaw, yaw_sigma=math.sqrt(float(own[2]))) if has_yaw else placed)
     return found
 
 
@@ -509,7 +504,12 @@ def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm
     return "\n".join(
         [
             *(*lines, "", *placed.lines, *([""] if placed.lines else [])),
-            *(*_corrections(before, found), *_frame(problem), *_remarks(problem, solution), *placed.remarks),
+            *(
+                *corrections(before, found, SURVEY),
+                *_frame(problem),
+                *_remarks(problem, solution),
+                *placed.remarks,
+            ),
         ]
     )
 
@@ -518,19 +518,7 @@ def _is_wrong(solution: Solution) -> BoolArray:
     return np.asarray(solution.used & (solution.weight < 0.1))
 
 
-def _corrections(before: Swarm, found: Swarm) -> list[str]:
-    """A sentence for each robot whose parameters were corrected."""
-    lines = []
-    for old, new in zip(before.robots, found.robots, strict=True):
-        pairs = [(f"{one.section}.{one.name}", one.of(old), one.of(new)) for one in SURVEY]
-        said = [f"{key} {a:.4f} -> {b:.4f}" for key, a, b in pairs if abs(b - a) > 0.0]
-        if said:
-            lines.append(f"Corrected for {new.name}: {', '.join(said)}.")
-    return lines
-
-
 def _frame(problem: BatchProblem) -> list[str]:
-    """What gives the frame."""
     if problem.is_known.any():
         return [f"The frame is that of the {int(problem.is_known.sum())} described landmarks."]
     if any(robot.start is not None for robot in problem.swarm.robots):
@@ -590,7 +578,6 @@ def _span(angles: FloatArray) -> float:
     return float(np.min(turned[kept - 1 : kept - 1 + ordered.size] - turned[: ordered.size]))
 
 
-_SIGMAS = 3.0
 _LEAST_SHARE = 0.02
 """Size of the largest ellipse, as a share of the arena, to which all are enlarged if they are smaller."""
 
@@ -603,9 +590,7 @@ def draw(done: Surveyed, path: Path) -> Path:
     # paths of the robots
     figure = Figure(figsize=(8.0, 7.0))
     axis = figure.subplots()
-    style(axis)
     axis.set_aspect("equal")
-    label_map(axis)
     for robot in np.unique(problem.knots.robot).tolist():
         own = done.path[problem.knots.robot == robot]
         axis.plot(own[:, 0], own[:, 1], color=colour_of(robot), linewidth=0.8, alpha=0.6)
@@ -614,26 +599,24 @@ def draw(done: Surveyed, path: Path) -> Path:
             axis.annotate(name, own[0, :2].tolist(), fontsize=8, color=colour_of(robot))
     # landmarks with ellipses, enlarged if the largest is small
     size = float(np.ptp(places, axis=0).max()) if len(places) else 1.0
-    axes = [np.linalg.eigh(one[:2, :2]) for one in solution.landmark_covariance[placed]]
-    largest = max((_SIGMAS * math.sqrt(max(float(one[0][-1]), 0.0)) for one in axes), default=0.0)
+    covariances = solution.landmark_covariance[placed]
+    largest = 3.0 * math.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2]).max(initial=0.0))
     factor = _LEAST_SHARE * size / largest if largest > 0.0 else 1.0
     factor = factor if factor > 1.5 else 1.0
-    for pose, (square, direction) in zip(solution.landmark[placed], axes, strict=True):
-        width, height = (2.0 * factor * _SIGMAS * np.sqrt(np.maximum(square, 0.0))).tolist()
-        angle = math.degrees(math.atan2(direction[1, 0], direction[0, 0]))
-        axis.add_patch(Ellipse(pose[:2], width, height, angle=angle, facecolor=SOFT, alpha=0.35))
+    for pose, covariance in zip(solution.landmark[placed], covariances, strict=True):
+        draw_ellipse(axis, pose, covariance, factor, SOFT)
         ahead = 0.02 * size * np.array([math.cos(pose[2]), math.sin(pose[2])])
         axis.plot(*np.stack([pose[:2], pose[:2] + ahead]).T, color=INK, linewidth=1.5)
     # ids of landmarks, cameras and anchors
     marks = [mark for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if is_in]
     for mark, place in zip(marks, places.tolist(), strict=True):
         axis.annotate(str(mark.id), place, (4, 4), textcoords="offset points", fontsize=7, color=INK)
-    fixed = [(camera.name, camera.x, camera.y, "s") for camera in done.swarm.cameras]
-    fixed += [(hex(anchor.address), anchor.x, anchor.y, "^") for anchor in done.swarm.anchors]
+    fixed = [(one.name, one.x, one.y, "s") for one in done.swarm.cameras]
+    fixed += [(hex(one.address), one.x, one.y, "^") for one in done.swarm.anchors]
     for name, x, y, symbol in fixed:
         axis.plot(x, y, symbol, color=INK, markersize=7)
         axis.annotate(name, (x, y), (6, 4), textcoords="offset points", fontsize=8, color=INK)
     note = f"3-sigma ellipses, enlarged {factor:.0f} x" if factor > 1.0 else "3-sigma ellipses"
-    axis.set_title(f"{len(marks)} landmarks ({note})", loc="left", fontsize=11, color=INK)
+    style(axis, f"{len(marks)} landmarks ({note})", *IN_MAP)
     save(figure, path)
     return path

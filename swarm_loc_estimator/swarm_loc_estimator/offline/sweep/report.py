@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.files import replacing, write_whole
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, length_unit, save, style
+from swarm_loc_estimator.offline.report.plots import SOFT, colour_of, length_unit, save, style
 from swarm_loc_estimator.offline.report.report import Table, page_of, picture
 from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Line, Sweep
 from swarm_loc_estimator.timeline.settings import Settings
@@ -94,11 +94,11 @@ def draw(rows: Sequence[Row], by: str, metrics: Sequence[Metric], path: Path) ->
     short = len({Path(bag).name for bag in bags}) == len(bags)
     figure = Figure(figsize=(4.2 * len(metrics), 3.6 + 0.2 * ((len(bags) + 2) // 3)))
     for axis, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
-        style(axis)
         known = [row for row in rows if row[metric.column] is not None]
         scale, unit = _scale(metric, [row[metric.column] for row in known])
-        axis.set_title(f"{metric.title}{unit and f' [{unit}]'}", loc="left", fontsize=10, color=INK)
-        places = _place(axis, by, values)
+        of = _UNITS.get(by, "1")
+        style(axis, f"{metric.title}{unit and f' [{unit}]'}", f"{by}{'' if of == '1' else f' [{of}]'}")
+        places = _place(axis, values)
         for index, bag in enumerate(bags):
             own = [row for row in known if row["bag"] == bag]
             low, mean, high = scale * _span(
@@ -118,10 +118,8 @@ def draw(rows: Sequence[Row], by: str, metrics: Sequence[Metric], path: Path) ->
     save(figure, path)
 
 
-def _place(axis: Axes, by: str, values: Sequence[Any]) -> list[float]:
-    """Label the horizontal axis; where the values are on it."""
-    unit = _UNITS.get(by, "1")
-    axis.set_xlabel(f"{by}{'' if unit == '1' else f' [{unit}]'}", color=SOFT, fontsize=9)
+def _place(axis: Axes, values: Sequence[Any]) -> list[float]:
+    """Where the values are on the horizontal axis, with their ticks."""
     if isinstance(values[0], str):
         axis.set_xticks(range(len(values)), values, rotation=20, ha="right")
         return [float(k) for k in range(len(values))]

@@ -127,8 +127,6 @@ def read_sweep(path: Path) -> Sweep:
 
 
 class _SweepReader(TreeChecks):
-    """Checks one file."""
-
     def __init__(self, path: Path) -> None:
         super().__init__(path, SweepFileError)
         self._folder = path.absolute().parent
@@ -138,7 +136,6 @@ class _SweepReader(TreeChecks):
         self._described = cache(_described)
 
     def sweep(self, tree: Tree) -> Sweep:
-        """All replays of the file."""
         said = self.mapping(tree, WHOLE_FILE, KEYS, required=("bags",))
         found = [bag for k, one in enumerate(self._some(said["bags"], "bags")) for bag in self._bags(one, k)]
         bags = list(dict.fromkeys(found))
@@ -166,7 +163,6 @@ class _SweepReader(TreeChecks):
         return Sweep(tuple(jobs), tuple(name for name in axes if len(axes[name]) > 1), int(workers), fit)
 
     def _fit(self, tree: Tree, grid: Collection[str]) -> Fit:
-        """The section `fit`."""
         said = self.mapping(tree, "fit", ("minimize", "trials", "ranges"), required=("trials", "ranges"))
         minimize = said.get("minimize", MINIMIZED[0])
         if minimize not in MINIMIZED:
@@ -204,14 +200,12 @@ class _SweepReader(TreeChecks):
         return values
 
     def _checked(self, value: Tree, key: str, spec: ParameterSpec) -> Any:
-        """The value of a parameter."""
         try:
             return replace(spec, name=key).checked(value)
         except ParameterError as error:
             raise self.said(str(error).removesuffix(".")) from error
 
     def _job(self, bag: str, swarm: str, values: dict[str, Value], share: float, seed: int | None) -> Job:
-        """One replay."""
         path = self._folder / bag
         swarm = swarm or str((Path(bag) if path.is_dir() else Path(bag).parent) / "swarm.yaml")
         described, digest = self._described(self._folder / swarm)
@@ -235,7 +229,6 @@ def _storages(bag: Path) -> list[Path]:
 
 
 def _digest(files: Sequence[Path]) -> str:
-    """Hash of the contents of files."""
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.stat().st_size.to_bytes(8, "big"))
@@ -401,7 +394,6 @@ class _Loky(LokyBackend):
     """Workers that end with this process; older versions of joblib have no argument for that."""
 
     def configure(self, **options: Any) -> int:
-        """Start the workers; their number."""
         started: int = super().configure(**options, initializer=end_with, initargs=(os.getpid(),))
         return started
 
@@ -430,7 +422,6 @@ def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _dask(count: int, address: str | None) -> Iterator[dict[str, Any]]:
-    """Workers of Dask."""
     client = loaded("distributed", "dask").Client
     local = {"n_workers": None if count < 0 else count, "threads_per_worker": 1, "dashboard_address": None}
     with _reached(address):

@@ -28,7 +28,8 @@ from swarm_loc_estimator.infrared.search import IrOutcome
 from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.calibration.robust import TO_SIGMA, spread
+from swarm_loc_estimator.offline.calibration.sightings import TO_SIGMA, spread
+from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
@@ -43,7 +44,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5  # Index of the first knot from which curves must decrease
-# Weights and limits are checked by test_board_fit.py and, on recordings of 2016, by make bench-droplet_real.
+# Weights and limits are checked by test_ir_boards.py and, on recordings of 2016, by make bench-droplet_real.
 _STEEPNESS, _BEND = 5.0, 0.8
 """Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)
@@ -213,7 +214,6 @@ class _Problem:
         return np.concatenate([limited.ravel(), self._held(unknowns)])
 
     def slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Jacobian of the residuals."""
         data, count, n = self._data, len(_KNOTS) - 1, self._platform.n
         law, sensor, emitter, yaw = self.parts(unknowns)
         distance, (alpha, beta) = self.angles(yaw)
@@ -246,15 +246,10 @@ class _Problem:
 
     def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
         """Jacobian of the regularization by finite differences, which are cheap here."""
-        here, slopes = self._held(unknowns), []
-        for k in range(unknowns.size):
-            ahead = unknowns.copy()
-            ahead[k] += _STEP
-            slopes.append((self._held(ahead) - here) / _STEP)
-        return np.stack(slopes, axis=1)
+        here, ahead = self._held(unknowns), unknowns + _STEP * np.eye(unknowns.size)
+        return np.stack([(self._held(one) - here) / _STEP for one in ahead], axis=1)
 
     def _held(self, unknowns: FloatArray) -> FloatArray:
-        """Residuals of the regularization and the priors."""
         law, sensor, emitter, yaw = self.parts(unknowns)
         held = [self._bend @ sensor, self._bend @ emitter, yaw / _YAW_SIGMA]
         held += [
@@ -300,7 +295,6 @@ def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
-    """The platform with noise and outlier shares estimated from its residuals."""
     expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
     known = np.isfinite(scatter)
     lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
@@ -520,20 +514,15 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
     found = solutions.outcomes == IrOutcome.FOUND
     errors = solutions.poses[found] - truth[found]
     errors[:, 1:] = wrap_angle(errors[:, 1:])
-    solved = np.linalg.solve(solutions.covariances[found], errors[..., None])[..., 0]
-    return HeldOut(errors, np.asarray(np.sum(errors * solved, axis=1)), len(found))
+    return HeldOut(errors, nees(errors, solutions.covariances[found]), len(found))
 
 
 def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
     """RMS residual of unsaturated readings at the true poses [sigma]."""
     bright = expected_brightness(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
-    usable = (
-        np.isfinite(data.readings) & (data.readings < platform.saturation) & (bright < platform.saturation)
-    )
-    sigma = np.hypot(platform.noise, platform.relative * bright)
-    return (
-        float(np.sqrt(np.mean(((data.readings - bright) / sigma)[usable] ** 2))) if usable.any() else np.inf
-    )
+    usable = (data.readings < platform.saturation) & (bright < platform.saturation)  # False for NaN
+    off = (data.readings - bright) / np.hypot(platform.noise, platform.relative * bright)
+    return float(np.sqrt(np.mean(off[usable] ** 2))) if usable.any() else np.inf
 
 
 def without_dead(
@@ -578,9 +567,5 @@ def _blocks(data: BoardReadings) -> NDArray[np.int64]:
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
-    """Concatenate the errors of several blocks."""
-    return HeldOut(
-        np.concatenate([part.errors for part in parts]),
-        np.concatenate([part.nees for part in parts]),
-        sum(part.asked for part in parts),
-    )
+    errors, normed = (np.concatenate([getattr(one, name) for one in parts]) for name in ("errors", "nees"))
+    return HeldOut(errors, normed, sum(part.asked for part in parts))

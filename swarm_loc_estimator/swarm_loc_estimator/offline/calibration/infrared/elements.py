@@ -43,7 +43,7 @@ from swarm_loc_estimator.infrared.search import DARKEST
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01  # Probability of a false alarm for any element: that it is dead, or that it saturates
-# Dead elements: checked by test_dead_elements.py and, on recordings of 2016, by make bench-droplet_real.
+# Dead elements: checked by test_ir_boards.py and, on recordings of 2016, by make bench-droplet_real.
 _DEAD_SHARES = (0.0, 0.15, 0.35)  # Shares of its light that a dead or shaded element gives
 _BRIGHT = 10.0
 """Minimum of the brightest reading of a usable exchange [sigma]; below, robots are out of range or sight."""
@@ -135,7 +135,6 @@ def _geometries(robot_of: IntArray, same: Callable[[int, list[int]], BoolArray])
 
 
 def _same_directions(directions: FloatArray, k: int, others: list[int]) -> BoolArray:
-    """Whether bearing and heading (of k, 2) are about the same."""
     apart: FloatArray = np.abs(wrap_angle(directions[others] - directions[k])).max(axis=1)
     return apart < _SAME_GEOMETRY
 
@@ -214,7 +213,7 @@ def stabilized(values: FloatArray, noise: FloatArray | float, relative: FloatArr
     return np.asarray(np.arcsinh(relative / noise * values) / relative)
 
 
-# Saturation and noise: checked by test_reading_limits.py.
+# Saturation and noise: checked by test_ir_boards.py.
 _SPAN, _WIDTHS = 0.3, (0.0, 0.005, 0.01, 0.02, 0.04)
 """Span below the highest reading, and widths of the windows at the top, relative to it."""
 _MIN_EMITTERS = 3
@@ -317,20 +316,17 @@ def contradictions(
 
 
 def _median_of_known(values: FloatArray) -> float:
-    """The median of the values that are not NaN; NaN where all are."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else math.nan
 
 
 def _same_readings(readings: FloatArray, k: int, others: list[int]) -> BoolArray:
-    """Whether readings (of k, n, n) are about the same."""
     apart = np.abs(readings[others] - readings[k]).max(axis=(1, 2))
     same: BoolArray = apart <= _SAME * np.maximum(readings[others].max(axis=(1, 2)), readings[k].max())
     return same
 
 
 def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
-    """Row indices of each ordered pair of robots, in order of time."""
     pairs = np.stack([exchanges.receiver, exchanges.transmitter])
     _, number = np.unique(pairs, axis=1, return_inverse=True)
     in_order = np.argsort(number.ravel(), kind="stable")

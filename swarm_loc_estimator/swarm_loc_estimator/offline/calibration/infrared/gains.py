@@ -37,8 +37,7 @@ from swarm_loc_estimator.offline.calibration.infrared.elements import (
     find_reading_limits,
     stabilized,
 )
-from swarm_loc_estimator.offline.calibration.motion import DENSE_GAP_NS
-from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
+from swarm_loc_estimator.offline.calibration.recording import DENSE_GAP_NS, CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.sensors.infrared import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
@@ -293,16 +292,14 @@ def _fit(group: BoardGroup, limits: ReadingLimits, progress: _Share) -> BoardFit
         CalibrationError: There are too few exchanges.
         GainsError: They do not determine gains.
     """
-    count = len(group.exchanges.receiver)
+    count, platform, robots = len(group.exchanges.receiver), group.platform, len(group.robots)
     if count < MIN_EXCHANGES:
         raise CalibrationError(f"{count} exchanges are too few, {MIN_EXCHANGES} are the least.")
     progress("dead elements")
-    elements = find_dead_elements(group.platform, len(group.robots), group.exchanges)
+    elements = find_dead_elements(platform, robots, group.exchanges)
     alive = elements.without(group.exchanges)
-    platform, robots = group.platform, len(group.robots)
     fit = estimate_gains(platform, robots, alive, progress)
-    helps = helpful_gains(platform, robots, alive, progress)
-    return BoardFit(group, fit, elements, limits, helps)
+    return BoardFit(group, fit, elements, limits, helpful_gains(platform, robots, alive, progress))
 
 
 def _groups(
@@ -367,18 +364,17 @@ def _with_fits(
     changed, left = list(robots), dict[str, list[str]]()
     for board in boards:
         for place, index in enumerate(board.group.robots):
-            gains = board.fit.gains[place]
-            changed[index] = _without_dead(robots[index], board.elements, place)
+            gains, why = board.fit.gains[place], ""
             if not board.of_robot(place)[0]:
-                left.setdefault("In no exchange that could be used", []).append(robots[index].name)
+                why = "In no exchange that could be used"
             elif gains == IrGains.unknown(board.group.platform):
                 why = "What they read contradicts itself or the ground truth"
-                left.setdefault(why, []).append(robots[index].name)
             elif not board.helps[place]:
                 why = "Gains do not help in exchanges that they were not estimated from"
+            alive = _without_dead(robots[index], board.elements, place)
+            changed[index] = alive if why else _with_gains(alive, gains)
+            if why:
                 left.setdefault(why, []).append(robots[index].name)
-            else:
-                changed[index] = _with_gains(changed[index], gains)
     return tuple(changed), left
 
 
@@ -397,7 +393,6 @@ def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
 
 
 def _with_gains(robot: Robot, gains: IrGains) -> Robot:
-    """The robot with gains, rounded to significant digits."""
     if robot.ir is None:
         return robot
     sensor, emitter = (tuple(round(v, _DECIMALS) for v in part) for part in (gains.sensor, gains.emitter))
@@ -406,5 +401,4 @@ def _with_gains(robot: Robot, gains: IrGains) -> Robot:
 
 
 def _counts(dropped: Counter[str]) -> str:
-    """Reasons with their counts."""
     return ", ".join(f"{count} {reason}" for reason, count in sorted(dropped.items()))
