@@ -118,6 +118,8 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     kind = robot_type_of(swarm)
     if options.world and kind.worlds and options.world not in kind.worlds:
         raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(kind.worlds)}.")
+    if options.aerial and kind is ROOM:
+        raise ParameterError("argument aerial = true must be false for robots without cameras.")
     kind.check(placed(options, swarm))
     return swarm
 

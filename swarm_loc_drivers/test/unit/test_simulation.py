@@ -19,6 +19,7 @@ from swarm_loc_drivers.sim.simulation import (
     simulated_swarm,
 )
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
+from swarm_loc_estimator import load_map
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.launch import parsed_options
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
@@ -98,6 +99,23 @@ def test_droplets_get_a_table_one_fleet_of_drivers_and_a_tracker(tmp_path: Path)
     assert nodes["droplet_fleet"].parameters["link_folder"] == world["link_folder"] == "/links"
     for name, node in nodes.items():
         assert node.parameters.get("use_sim_time", False) is (name != "droplet_world")
+
+
+def test_robots_without_cameras_are_in_a_room_whose_map_is_drawn_where_it_is_missing(tmp_path: Path) -> None:
+    file, floor = tmp_path / "swarm.yaml", tmp_path / "map.yaml"
+    options = ["--yes", "--type", "turtlebot4", "--robots", "2", "--map", str(floor)]
+    assert new.main([str(file), *options, "--sensors", "lidar,map,mocap"]) == 0
+    chosen = SimulationOptions(str(file), plan="tee")
+    nodes = {node.full_name: node for node in graph_of(chosen, simulated_swarm(chosen), str(tmp_path))}
+    assert list(nodes) == ["estimator", "room_world", "localizer_bridge"]
+    assert nodes["estimator"].parameters["swarm_file"] == str(file)
+    assert nodes["room_world"].parameters["plan"] == "tee"
+    assert (load_map(floor).free.shape, floor.with_suffix(".pgm").exists()) == ((184, 144), True)
+    before = floor.stat().st_mtime_ns
+    graph_of(chosen, simulated_swarm(chosen), str(tmp_path))
+    assert floor.stat().st_mtime_ns == before
+    with pytest.raises(ParameterError, match="argument aerial = true must be false for robots without cam"):
+        simulated_swarm(replace(chosen, aerial=True))
 
 
 @pytest.mark.parametrize("robots", [2, 4, 5, 12])

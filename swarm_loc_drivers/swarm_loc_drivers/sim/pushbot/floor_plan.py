@@ -246,7 +246,7 @@ def is_blocked(walls: FloatArray, radii: FloatArray, poses: FloatArray, robot: i
         away = math.hypot(x - poses[k, 0], y - poses[k, 1])
         if k != robot and away < radii[robot] + radii[k]:
             return True
-    return clearance(walls, np.empty((0, 2)), 0.0, x, y) < radii[robot]
+    return bool(clearance(walls, np.empty((0, 2)), 0.0, x, y) < radii[robot])
 
 
 @cached_njit

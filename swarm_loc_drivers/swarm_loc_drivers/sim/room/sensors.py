@@ -316,7 +316,8 @@ class MotionCapture(SimulatedSensor):
             raise WorldError(
                 f"localizer.source is '{localizer.source}', and simulated motion capture has only 'pose'."
             )
-        bodies = dict(reversed(one.split("=")) if "=" in one else (one, one) for one in localizer.bodies)
+        pairs = (one.partition("=") for one in localizer.bodies)
+        bodies = {robot or body: body for body, _, robot in pairs}
         self._offsets = {
             name: np.array([float(number) for number in numbers.split(",")])
             for name, _, numbers in (one.partition("=") for one in localizer.offsets)

@@ -69,7 +69,8 @@ def draw_missing_map(swarm: Swarm, room: Room) -> None:
 
 def _rectangle(swarm: Swarm) -> FloatArray:
     """Walls around the origin, all anchors and landmarks, and most of what ceiling cameras see."""
-    places = [(one.x, one.y) for one in (*swarm.anchors, *swarm.landmarks)]
+    places = [(one.x, one.y) for one in swarm.anchors]
+    places += [(one.x, one.y) for one in swarm.landmarks]
     for one in swarm.cameras:
         across, along = (_IN_VIEW * one.z * view for view in VIEW)
         corners = [(a * along, b * across) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
@@ -174,7 +175,8 @@ class RoomWorld:
         model = Drive(self._separation, 0.0)
         rolled = roll(self.poses, speed, turn_rate, model, step_s, noise)
         before, self.poses = self.poses, kept_clear(self.walls, self.radii, self.poses, rolled)
-        said = twist_of(wheel_paths(*self.velocities.T, self._separation, step_s), self._separation)
+        paths = wheel_paths(self.velocities[:, 0], self.velocities[:, 1], self._separation, step_s)
+        said = twist_of(paths, self._separation)
         said[(self.poses[:, :2] == before[:, :2]).all(axis=1), 0] = 0.0  # wheels stall, too
         self.reported = se2.compose(self.reported, integrate(said[None])[1])
         self.now_ns += STEP_NS
