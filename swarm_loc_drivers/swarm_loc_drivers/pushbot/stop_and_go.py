@@ -27,7 +27,7 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 """[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
-_BLIND_DRIVE = 0.4  # Way of a robot that gets no goal after a restart, ahead or to where it is farthest [m]
+_BLIND_DRIVE = 0.4  # Way of a lost robot that gets no goal, ahead or to where it is farthest [m]
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
 """Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
@@ -96,6 +96,7 @@ class StopAndGo:
         self._anchor: FloatArray | None = None
         self._since_ns = 0
         self._goal_ns = -1
+        self._is_lost = self.restarts > 0  # or a scan brought no goal, so that the mapper may have lost it
         self._fixed: tuple[float, float] | None = None
         self._is_near = False
         self._distances: deque[float] = deque(maxlen=3)
@@ -118,7 +119,7 @@ class StopAndGo:
         if there is None or goal.stamp_ns <= self._goal_ns:
             return False
         self.goals += 1
-        self._goal_ns = goal.stamp_ns
+        self._goal_ns, self._is_lost = goal.stamp_ns, False
         self._learn_ratio(float(goal.pose[2]), float(there[2]))
         way = goal.position - goal.pose[:2]
         length = math.hypot(way[0], way[1])
@@ -146,12 +147,12 @@ class StopAndGo:
             self._moves.popleft()
             self._anchor, self._since_ns = None, stamp_ns
         if stamp_ns - self._since_ns > 1e9 * self._settings.patience_s:
-            # after a restart, scans of several places tell the mapper where it is
-            if self.restarts and self._goal_ns < 0:
+            # scans of several places tell a mapper that has lost it where it is
+            if self._is_lost:
                 if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
                     self._moves.append(_Turn(self._open_heading, self._settings.turn_rate))
                 self._moves.append(_Drive(_BLIND_DRIVE))
-            self._farthest = 0.0
+            self._farthest, self._is_lost = 0.0, True
             self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
         return STILL
 
