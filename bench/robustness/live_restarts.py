@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping
+import os
+import signal
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from multiprocessing import get_context
@@ -20,7 +21,7 @@ from multiprocessing import get_context
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from bench.robustness.pauses import go, misleading_share, simulated, stopped, trajectories
+from bench.robustness.pauses import misleading_share, simulated, stopped, trajectories
 from bench.shared.common import ProgressLine
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
@@ -34,22 +35,41 @@ from swarm_loc_estimator.watch.server import free_port
 PLANS = ("corridor", "office")
 _ROBOTS = ("pushbot1", "pushbot2")
 _AGAIN_S, _PATIENCE_S = 10.0, 240.0
+_BETWEEN_S = (2.0, 30.0)  # From when all are located until the next restart: within two drives and scans
 
 
 async def _pass_on(port: int, robot_port: int) -> None:
-    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while data := await reader.read(4096):
-            writer.write(data)
-            await writer.drain()
-        writer.close()
+    """Pass bytes between a robot and one driver at a time; those of the robot are lost without a driver."""
+    from_robot, to_robot = await asyncio.open_connection("localhost", robot_port)
+    drivers: list[asyncio.StreamWriter] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        drivers.append(writer)
         with suppress(OSError), closing(writer):
-            from_robot, to_robot = await asyncio.open_connection("localhost", robot_port)
-            await asyncio.gather(pump(reader, to_robot), pump(from_robot, writer))
+            while data := await reader.read(4096):
+                to_robot.write(data)
+                await to_robot.drain()
+        drivers.remove(writer)
 
-    async with await asyncio.start_server(serve, "localhost", port) as server:
-        await server.serve_forever()
+    async def pull_or_plug_in() -> None:
+        while True:
+            async with await asyncio.start_server(serve, "localhost", port):
+                await switched.wait()
+            switched.clear()
+            for driver in drivers:
+                driver.close()
+            await switched.wait()
+            switched.clear()
+
+    switched = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, switched.set)
+    switching = asyncio.create_task(pull_or_plug_in())
+    while data := await from_robot.read(4096):
+        for driver in [one for one in drivers if not one.is_closing()]:
+            with suppress(OSError):
+                driver.write(data)
+                await driver.drain()
+    switching.cancel()
 
 
 def _run_cable(port: int, robot_port: int) -> None:
@@ -57,17 +77,22 @@ def _run_cable(port: int, robot_port: int) -> None:
 
 
 class _Cable:
-    """A TCP connection to a robot: a process that passes its bytes on."""
+    """A TCP connection to a robot that can be pulled, by a process that passes its bytes on.
+
+    The robot keeps one connection, as to a module on its board, and does not notice who comes and goes.
+    """
 
     def __init__(self, port: int, robot_port: int) -> None:
-        self._start = partial(get_context("spawn").Process, target=_run_cable, args=(port, robot_port))
-        self.plug_in()
-
-    def plug_in(self) -> None:
-        self._process = self._start(daemon=True)
+        self._process = get_context("spawn").Process(target=_run_cable, args=(port, robot_port), daemon=True)
         self._process.start()
 
-    def pull(self) -> None:
+    def switch(self) -> None:
+        """Pull the cable, or plug it in."""
+        assert self._process.pid is not None  # noqa: S101 # it has been started
+        os.kill(self._process.pid, signal.SIGUSR1)
+
+    def remove(self) -> None:
+        """End the process."""
         self._process.kill()
         self._process.join()
 
@@ -92,17 +117,27 @@ class _Run:
         place = np.array([pose.x, pose.y, yaw_of(q.x, q.y, q.z, q.w)])
         self.fixes.append((nanoseconds(message.header.stamp), name, place, covariance))
 
+    @property
+    def now_ns(self) -> int:
+        """Time of the graph, which passes slowly on a busy computer; 0 before the first poses."""
+        poses = self._graph.recorder.poses()
+        return poses[-1].stamp_ns if poses else 0
+
+    def go(self, seconds: float, needed: Collection[str] | None = None) -> None:
+        """Let time pass; only the nodes that are needed must run."""
+        end_ns = self.now_ns + round(seconds * 1e9)
+        self._graph.wait_for(lambda: self.now_ns > end_ns, "go on", START_PATIENCE_S, needed)
+
     def located_s(self, names: set[str], since_ns: int) -> float:
-        """Wait until there are fixes of robots later than an instant; how long that takes [s], or NaN."""
-        begin_s = time.monotonic()
+        """Wait until there are fixes of robots later than an instant; how much later they are [s], or NaN."""
+        found: dict[str, int] = {}
 
         def is_over() -> bool:
-            found = {name for at, name, *_ in self.fixes if at > since_ns}
-            return names <= found or time.monotonic() > begin_s + _PATIENCE_S
+            found.update({name: at for at, name, *_ in reversed(self.fixes) if at > since_ns})
+            return names <= found.keys() or self.now_ns > since_ns + 1e9 * _PATIENCE_S
 
         self._graph.wait_for(is_over, "go on", START_PATIENCE_S)
-        waited_s = time.monotonic() - begin_s
-        return waited_s if waited_s < _PATIENCE_S else math.nan
+        return (max(found[name] for name in names) - since_ns) * 1e-9 if names <= found.keys() else math.nan
 
     @contextmanager
     def _killed(self, name: str) -> Iterator[None]:
@@ -113,9 +148,9 @@ class _Run:
 
     @contextmanager
     def _unplugged(self, name: str) -> Iterator[None]:
-        self._cables[name].pull()
+        self._cables[name].switch()
         yield
-        self._cables[name].plug_in()
+        self._cables[name].switch()
 
     def interrupt(self, kind: str, names: set[str], seconds: float) -> None:
         """Let drivers hear nothing of their robots for a while."""
@@ -124,13 +159,10 @@ class _Run:
             "unplugged": self._unplugged,
             "stopped": lambda name: stopped(self._graph.process(f"{name}/pushbot_driver").pid),
         }
-        end_s = time.monotonic() + seconds
         with ExitStack() as stack:
             for name in names:
                 stack.enter_context(ways[kind](name))  # type: ignore[arg-type]
-            self._graph.wait_for(
-                lambda: time.monotonic() > end_s, "go on", START_PATIENCE_S, needed=[ESTIMATOR]
-            )
+            self.go(seconds, needed=[ESTIMATOR])
 
 
 def _errors(fixes: list[Fix], paths: Mapping[str, Trajectory]) -> tuple[FloatArray, int]:
@@ -154,22 +186,24 @@ def _run(plan: str, restarts: int, seconds: float, say: ProgressLine) -> tuple[d
         graph, swarm, truth = stack.enter_context(simulated("pushbots", plan, port, len(_ROBOTS)))
         cables = {name: _Cable(port + len(_ROBOTS) + k, port + k) for k, name in enumerate(_ROBOTS)}
         for cable in cables.values():
-            stack.callback(cable.pull)
-        run, begin_s = _Run(graph, cables), time.monotonic()
-        run.located_s({*_ROBOTS}, 0)
-        begin_ns = graph.recorder.poses()[-1].stamp_ns
+            stack.callback(cable.remove)
+        run = _Run(graph, cables)
+        graph.wait_for(lambda: run.now_ns > 0, "begin", START_PATIENCE_S)
+        first_ns = run.now_ns
+        run.located_s({*_ROBOTS}, first_ns)
+        begin_ns = run.now_ns
         for number in range(restarts):
             say(f"{plan}, live: restart {number + 1} of {restarts}")
-            go(graph, rng.uniform(5.0, 60.0))
+            run.go(rng.uniform(*_BETWEEN_S))
             kind = ("killed", "unplugged", "stopped")[number % 3]
             names = {*_ROBOTS} if number % 4 == 3 else {_ROBOTS[rng.integers(2)]}
             run.interrupt(kind, names, rng.uniform(2.0, 6.0))
             if number % 3 == 2:
-                go(graph, _AGAIN_S)
+                run.go(_AGAIN_S)
                 run.interrupt("killed", names, rng.uniform(2.0, 6.0))
-            waits.append(run.located_s(names, graph.recorder.poses()[-1].stamp_ns))
-        go(graph, max(1.0, seconds - (time.monotonic() - begin_s)))
-        paths = trajectories(truth)
+            waits.append(run.located_s(names, run.now_ns))
+        run.go(max(1.0, seconds - (run.now_ns - first_ns) * 1e-9))
+        end_ns, paths = run.now_ns, trajectories(truth)
         result = graph.recorder.result(plan, swarm, paths)
     errors, wrong = _errors(run.fixes, paths)
     return {
@@ -178,7 +212,7 @@ def _run(plan: str, restarts: int, seconds: float, say: ProgressLine) -> tuple[d
         "tracked_misleading_share": misleading_share(result, paths, begin_ns),
         "position_cm": 100.0 * math.sqrt(np.square(errors).mean()),
         "worst_cm": 100.0 * float(errors.max()),
-        "seconds": time.monotonic() - begin_s,
+        "seconds": (end_ns - first_ns) * 1e-9,
     }, waits
 
 

@@ -231,6 +231,13 @@ def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() ->
     assert cells > 500
 
 
+def test_stops_without_a_sweep_are_taken_back_wherever_they_are_in_the_graph() -> None:
+    mapper = CooperativeMapper()
+    for node in (0, 1000):
+        mapper.sweeps.drop(node)
+    assert not mapper.sweeps.drawn
+
+
 def test_a_full_graph_locates_robots_without_growing() -> None:
     rng, mapper = np.random.default_rng(3), CooperativeMapper(MapperSettings(max_stops=90))
     robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
