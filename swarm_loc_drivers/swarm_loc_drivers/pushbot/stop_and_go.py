@@ -27,7 +27,7 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 """[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
-_BLIND_DRIVE = 0.4  # Way of a robot that gets no goal after a restart, ahead or to where it is farthest [m]
+_BLIND_DRIVE = 0.4  # Way of a lost robot that gets no goal, ahead or to where it is farthest [m]
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
 """Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
@@ -87,6 +87,7 @@ class StopAndGo:
         self._anchor: FloatArray | None = None
         self._since_ns = 0
         self._goal_ns = -1
+        self._is_lost = self.restarts > 0  # or a scan brought no goal, so that the mapper may have lost it
         self._fixed: tuple[float, float] | None = None
         self._is_near = False
         self._distances: deque[float] = deque(maxlen=3)
@@ -112,6 +113,7 @@ class StopAndGo:
         poses = np.array([row[1:] for row in track])
         there = np.array([np.interp(0.0, since_ns, column) for column in poses.T])
         self.goals += 1
+<<<<<<< HEAD
         self._goal_ns = goal.stamp_ns
         # estimate the wheel slip from the headings of two fixes and the odometry between them
         heading, by_odometry = float(goal.pose[2]), float(there[2])
@@ -120,6 +122,10 @@ class StopAndGo:
             self.ratio = min(max(self.ratio + wrong / turned, _LOW_RATIO), _HIGH_RATIO)
         self._fixed = (heading, by_odometry)
         # turn to the goal, drive there, and scan
+=======
+        self._goal_ns, self._is_lost = goal.stamp_ns, False
+        self._learn_ratio(float(goal.pose[2]), float(there[2]))
+>>>>>>> restarts
         way = goal.position - goal.pose[:2]
         length = math.hypot(way[0], way[1])
         self._moves.clear()
@@ -146,13 +152,18 @@ class StopAndGo:
             self._moves.popleft()
             self._anchor, self._since_ns = None, stamp_ns
         if stamp_ns - self._since_ns > 1e9 * self._settings.patience_s:
-            # after a restart, scans of several places tell the mapper where it is
-            if self.restarts and self._goal_ns < 0:
+            # scans of several places tell a mapper that has lost it where it is
+            if self._is_lost:
                 if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
                     self._moves.append(_Turn(self._open_heading, self._settings.turn_rate, is_heading=True))
                 self._moves.append(_Drive(_BLIND_DRIVE))
+<<<<<<< HEAD
             self._farthest = 0.0
             self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
+=======
+            self._farthest, self._is_lost = 0.0, True
+            self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
+>>>>>>> restarts
         return STILL
 
     def _remember(self, stamp_ns: int, pose: FloatArray) -> FloatArray:

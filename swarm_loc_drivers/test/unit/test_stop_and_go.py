@@ -114,6 +114,19 @@ def test_without_a_goal_it_looks_again_after_a_while() -> None:
     assert robot.now_ns - before_ns == pytest.approx(1e9 * SETTINGS.patience_s, abs=1e8)
 
 
+def test_where_two_scans_bring_no_goal_it_looks_from_another_place() -> None:
+    """A mapper that was stopped for a while has lost a robot whose odometry has not restarted."""
+    robot = looked_around()
+    robot.go(1.5, 2.0)
+    place = robot.pose[:2].copy()
+    for way in (0.0, 0.4):
+        while not robot.step():
+            pass
+        robot.until_still()
+        assert math.dist(robot.pose[:2], place) == pytest.approx(way, abs=0.01)
+    assert robot.motion.restarts == 0
+
+
 def test_something_ahead_ends_a_drive_and_it_looks_around_there() -> None:
     robot = looked_around()
     pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])

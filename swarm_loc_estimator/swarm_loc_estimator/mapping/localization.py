@@ -215,7 +215,7 @@ def close_loop(graph: PoseGraph, stop: int) -> bool:
 def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> None:
     """Add a tie of a stop at a pose (3,) to the first of `against`, and solve the whole graph."""
     relative = between(graph.states[against[0], :3], pose)
-    graph.constraints.add_tie(against[0], stop, relative, _TIE_ROOT)
+    graph.constraints.ties.add(against[0], stop, relative, _TIE_ROOT)
     graph.solve(4)
     for one in dict.fromkeys([stop, *against]):
         graph.targets[one] = graph.neighbours(one, _LOOP_TARGETS, _MIN_LOOP_OVERLAP)
@@ -353,4 +353,4 @@ def _add_bearing(graph: PoseGraph, sighting: LightBetween) -> None:
     away = math.dist(graph.states[seer, :2], graph.states[seen, :2])
     if away > 2.0 * _LIGHT_OFFSET:
         sigma = math.hypot(_LEAST_SIGMA, _LIGHT_OFFSET / away)
-        graph.constraints.add_bearing(seer, seen, sighting.turn, sighting.bearing, sigma)
+        graph.constraints.bearings.add(seer, seen, sighting.turn, sighting.bearing, sigma)

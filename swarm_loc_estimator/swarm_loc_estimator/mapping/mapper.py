@@ -429,7 +429,7 @@ class CooperativeMapper:
             node = self._replace(track.node, pose, sigma, stop)
         else:
             node = self.graph.add_stop(robot, pose, stop.sigma)
-            self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
+            self.graph.constraints.departures.add(begin, node, self.graph.turned[begin], motion, sigma)
         self.begin_ns[node] = int(stop.stamp_ns[0])
         self.graph.set_scan(node, stop.scan(0, count))
         track.node, track.passes = node, self.graph.count > self.settings.max_stops
@@ -457,13 +457,13 @@ class CooperativeMapper:
             self.sweeps.drop(begin)
             pose = self.sweeps.locate(sweep, pose, motion)
             graph.reuse_stop(begin, pose, sweep.sigma)
-            graph.constraints.add_prior(begin, pose, _LOCATED_SIGMA)
+            graph.constraints.priors.add(begin, begin, pose, _LOCATED_SIGMA)
             return
         node = track.node = graph.add_stop(robot, pose, sweep.sigma)
         track.passes = graph.count > self.settings.max_stops
         self.begin_ns[node] = int(sweep.stamp_ns[0])
         if begin is None:
-            graph.constraints.add_prior(node, track.prior, np.minimum(track.prior_sigma, 1.0))
+            graph.constraints.priors.add(node, node, track.prior, np.minimum(track.prior_sigma, 1.0))
             self.sweeps.begin(node, sweep, floats=not np.isfinite(track.prior_sigma).all())
         else:
             sigma = self._motion_sigma(track.path, abs(float(motion[2])))
@@ -482,7 +482,7 @@ class CooperativeMapper:
         self._lights.forget_node(node)
         self.graph.reuse_stop(node, pose, stop.sigma)
         drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
-        self.graph.constraints.add_prior(node, pose, np.hypot(known, drive))
+        self.graph.constraints.priors.add(node, node, pose, np.hypot(known, drive))
         return node
 
     def _motion_sigma(self, path: float, turn: float) -> FloatArray:
@@ -510,9 +510,9 @@ class CooperativeMapper:
             self.graph.set_scan(node, stop.scan(first, last))
             if nodes:
                 turned = self.graph.turned[nodes[-1]]
-                self.graph.constraints.add_departure(nodes[-1], node, turned, np.zeros(3), _PART_SIGMA)
+                self.graph.constraints.departures.add(nodes[-1], node, turned, np.zeros(3), _PART_SIGMA)
             else:
-                self.graph.constraints.add_prior(node, track.prior, track.prior_sigma)
+                self.graph.constraints.priors.add(node, node, track.prior, track.prior_sigma)
             pose = np.array([pose[0], pose[1], self.graph.heading_at_departure(node)])
             stop.begin = first
             self.begin_ns[node] = int(stop.stamp_ns[first])

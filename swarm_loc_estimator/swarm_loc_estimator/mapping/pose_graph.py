@@ -7,7 +7,7 @@ per robot follows the unknowns of all stops. Residuals are estimates minus measu
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,101 +33,86 @@ class Linearised(NamedTuple):
     weight: FloatArray  # (m, e) inverse variance
 
 
-class Departures(NamedTuple):
-    """Odometry from stop to stop (m,)."""
+def odometry(states: FloatArray, begin: IntArray, end: IntArray, given: FloatArray) -> Linearised:
+    """Residuals of odometry (m, 7) from stop to stop, along and across the motion.
 
-    begin: IntArray  # (m,) stop of departure
-    end: IntArray  # (m,) stop of arrival
-    turn: FloatArray  # (m,) turn by odometry at the stop of departure [rad]
-    motion: FloatArray  # (m, 3) pose on arrival in the frame at departure, by odometry
-    sigma: FloatArray  # (m, 3) along the motion [m], across it [m], of the heading [rad]
-
-
-class Ties(NamedTuple):
-    """Relative poses (m,) of stops, from scan matching."""
-
-    begin: IntArray  # (m,) reference stop
-    end: IntArray  # (m,) stop whose pose in the frame of `begin` is given
-    pose: FloatArray  # (m, 3)
-    root: FloatArray  # (m, 3, 3) square root of its information
+    `given` has the turn by odometry at the stop of departure [rad], the pose on arrival (3,) in the frame at
+    departure, and sigmas (3,) along the motion [m], across it [m] and of the heading [rad].
+    """
+    turn, motion = given[:, 0], given[:, 1:4]
+    course = np.arctan2(motion[:, 1], motion[:, 0])
+    index, jacobian, residual = _relative(states, begin, end, turn, turn + motion[:, 2], course)
+    residual[:, 0] -= np.hypot(motion[:, 0], motion[:, 1])
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    return Linearised(index, jacobian, residual, given[:, 4:] ** -2.0)
 
 
-class Bearings(NamedTuple):
-    """Bearings (m,) of lights of robots at other stops."""
+def ties(states: FloatArray, begin: IntArray, end: IntArray, given: FloatArray) -> Linearised:
+    """Residuals of relative poses of stops from scan matching.
 
-    begin: IntArray  # (m,) stop from which the light was seen
-    end: IntArray  # (m,) stop of the other robot
-    turn: FloatArray  # (m,) turn by odometry at which it was seen [rad]
-    bearing: FloatArray  # (m,) of the light in the robot's frame then [rad]
-    sigma: FloatArray  # (m,) [rad]
+    `given` (m, 12) has poses (3,) in the frame of `begin`, and square roots (9,) of their information.
+    """
+    index, jacobian, pose = _relative(states, begin, end, *np.zeros((3, len(begin))))
+    root, residual = given[:, 3:].reshape(-1, 3, 3), pose - given[:, :3]
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    residual = np.einsum("mab,mb->ma", root, residual)
+    return Linearised(index, root @ jacobian, residual, np.ones_like(residual))
 
 
-def odometry(states: FloatArray, given: Departures) -> Linearised:
-    """Residuals of odometry, along and across the motion."""
-    begin, end = states[given.begin], states[given.end]
-    swing = given.turn + given.motion[:, 2]
-    course = np.arctan2(given.motion[:, 1], given.motion[:, 0])
-    heading = begin[:, 2] + begin[:, 3] * given.turn + course
+def _relative(
+    states: FloatArray,
+    begin: IntArray,
+    end: IntArray,
+    turn: FloatArray,
+    swing: FloatArray,
+    course: FloatArray,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Unknowns (m, 7), Jacobian (m, 3, 7) and poses (m, 3) of stops in the frames of others after a turn.
+
+    The frame is off by the course, and headings count from that after `swing`; turns are by odometry [rad].
+    """
+    here, there = states[begin], states[end]
+    heading = here[:, 2] + here[:, 3] * turn + course
     cos, sin = np.cos(heading), np.sin(heading)
-    dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
+    dx, dy = there[:, 0] - here[:, 0], there[:, 1] - here[:, 1]
     along, across = cos * dx + sin * dy, -sin * dx + cos * dy
-    length = np.hypot(given.motion[:, 0], given.motion[:, 1])
-    turned = wrap_angle(end[:, 2] - begin[:, 2] - begin[:, 3] * swing)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
     jacobian = np.stack(
         [
-            np.stack([-cos, -sin, across, across * given.turn, cos, sin, zero], -1),
-            np.stack([sin, -cos, -along, -along * given.turn, -sin, cos, zero], -1),
+            np.stack([-cos, -sin, across, across * turn, cos, sin, zero], -1),
+            np.stack([sin, -cos, -along, -along * turn, -sin, cos, zero], -1),
             np.stack([zero, zero, -one, -swing, zero, zero, one], -1),
         ],
         1,
     )
-    index = np.hstack([_unknowns(given.begin, 4), _unknowns(given.end, 3)])
-    residual = np.stack([along - length, across, turned], -1)
-    return Linearised(index, jacobian, residual, given.sigma**-2.0)
+    pose = np.stack([along, across, there[:, 2] - here[:, 2] - here[:, 3] * swing], -1)
+    return np.hstack([_unknowns(begin, 4), _unknowns(end, 3)]), jacobian, pose
 
 
-def ties(states: FloatArray, given: Ties) -> Linearised:
-    """Residuals of relative poses of stops."""
-    begin, end = states[given.begin], states[given.end]
-    cos, sin = np.cos(begin[:, 2]), np.sin(begin[:, 2])
-    dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
-    ahead, left = cos * dx + sin * dy, -sin * dx + cos * dy
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    jacobian = np.stack(
-        [
-            np.stack([-cos, -sin, left, cos, sin, zero], -1),
-            np.stack([sin, -cos, -ahead, -sin, cos, zero], -1),
-            np.stack([zero, zero, -one, zero, zero, one], -1),
-        ],
-        1,
-    )
-    residual = np.stack([ahead, left, end[:, 2] - begin[:, 2]], -1) - given.pose
-    residual[:, 2] = wrap_angle(residual[:, 2])
-    index = np.hstack([_unknowns(given.begin, 3), _unknowns(given.end, 3)])
-    residual = np.einsum("mab,mb->ma", given.root, residual)
-    return Linearised(index, given.root @ jacobian, residual, np.ones_like(residual))
+def bearings(states: FloatArray, begin: IntArray, end: IntArray, given: FloatArray) -> Linearised:
+    """Residuals of bearings of lights of robots at other stops, with a robust loss.
 
-
-def bearings(states: FloatArray, given: Bearings) -> Linearised:
-    """Residuals of bearings of lights, with a robust loss."""
-    begin, end = states[given.begin], states[given.end]
-    dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
+    `given` (m, 3) has the turn by odometry at which each was seen, the bearing in the robot's frame then, and
+    its sigma [rad].
+    """
+    turn, bearing, sigma = given.T
+    here, there = states[begin], states[end]
+    dx, dy = there[:, 0] - here[:, 0], there[:, 1] - here[:, 1]
     square = dx * dx + dy * dy
-    residual = wrap_angle(np.arctan2(dy, dx) - begin[:, 2] - begin[:, 3] * given.turn - given.bearing)
+    residual = wrap_angle(np.arctan2(dy, dx) - here[:, 2] - here[:, 3] * turn - bearing)
     one = np.ones_like(dx)
-    jacobian = np.stack([dy / square, -dx / square, -one, -given.turn, -dy / square, dx / square], -1)
-    robust = 1.0 + (residual / given.sigma) ** 2 / 9.0
-    index = np.hstack([_unknowns(given.begin, 4), _unknowns(given.end, 2)])
-    return Linearised(index, jacobian[:, None, :], residual[:, None], (given.sigma * robust)[:, None] ** -2.0)
+    jacobian = np.stack([dy / square, -dx / square, -one, -turn, -dy / square, dx / square], -1)
+    robust = 1.0 + (residual / sigma) ** 2 / 9.0
+    index = np.hstack([_unknowns(begin, 4), _unknowns(end, 2)])
+    return Linearised(index, jacobian[:, None, :], residual[:, None], (sigma * robust)[:, None] ** -2.0)
 
 
-def priors(states: FloatArray, stop: IntArray, pose: FloatArray, sigma: FloatArray) -> Linearised:
-    """Residuals of priors on poses (m, 3) of stops (m,) with standard deviations (m, 3)."""
-    residual = states[stop, :3] - pose
+def priors(states: FloatArray, stop: IntArray, _: IntArray, given: FloatArray) -> Linearised:
+    """Residuals of priors on poses of stops (m,); `given` (m, 6) has poses and standard deviations."""
+    residual = states[stop, :3] - given[:, :3]
     residual[:, 2] = wrap_angle(residual[:, 2])
     jacobian = np.broadcast_to(np.eye(3), (len(stop), 3, 3))
-    return Linearised(_unknowns(stop, 3), jacobian, residual, sigma**-2.0)
+    return Linearised(_unknowns(stop, 3), jacobian, residual, given[:, 3:] ** -2.0)
 
 
 def ratios(states: FloatArray, slip: FloatArray, robot: IntArray, sigma: FloatArray) -> Linearised:
@@ -195,17 +180,12 @@ class NormalEquations:
         self._rows.append(rows[both])
         self._columns.append(columns[both])
 
-    def system(self) -> tuple[csc_matrix, FloatArray]:
-        """The matrix (f, f) and right side (f,) of the free unknowns."""
-        diagonal = np.arange(self._size)
-        values = np.concatenate([*self._values, np.full(self._size, _DAMPING)])
-        rows = np.concatenate([*self._rows, diagonal])
-        columns = np.concatenate([*self._columns, diagonal])
-        return csc_matrix((values, (rows, columns)), shape=(self._size, self._size)), self._gradient
-
     def solve(self) -> tuple[FloatArray, NormalFactor, float]:
         """The step (u,), zero for fixed unknowns, the factor for covariances, and the fall of `squares`."""
-        matrix, gradient = self.system()
+        diagonal, gradient = np.arange(self._size), self._gradient
+        values = np.concatenate([*self._values, np.full(self._size, _DAMPING)])
+        rows, columns = (np.concatenate([*one, diagonal]) for one in (self._rows, self._columns))
+        matrix = csc_matrix((values, (rows, columns)), shape=(self._size, self._size))
         options = {"SymmetricMode": True}
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         step, free = np.zeros(len(self._free)), factor.solve(gradient)
@@ -252,7 +232,7 @@ class PairRows:
         if self.count == len(self._stops):
             self._stops, self._values = doubled(self._stops), doubled(self._values)
         self._stops[self.count] = begin, end
-        self._values[self.count] = np.hstack(values)
+        self._values[self.count] = np.concatenate([np.ravel(one) for one in values])
         self.count += 1
 
     def remove(self, gone: BoolArray) -> None:
@@ -269,9 +249,17 @@ class PairRows:
 
 
 class ConstraintLists:
-    """Priors, odometry, ties and bearings in order of insertion."""
+    """Constraints of each kind; their numbers are those of the functions above.
+
+    Attributes:
+        priors: On poses of stops, with each stop twice.
+        departures: Odometry from stop to stop.
+        ties: Relative poses.
+        bearings: Of lights.
+    """
 
     def __init__(self) -> None:
+<<<<<<< HEAD
         self._priors, self._departures, self._ties, self._bearings = map(PairRows, (6, 7, 12, 3))
 
     def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
@@ -298,34 +286,23 @@ class ConstraintLists:
         """Remove the ties of two stops."""
         first, last, _ = self._ties.columns
         self._ties.remove((first == begin) & (last == end))
+=======
+        self.priors, self.departures, self.ties, self.bearings = map(_Rows, (6, 7, 12, 3))
+>>>>>>> restarts
 
     def remove_stop(self, stop: int) -> None:
         """Remove all constraints on a stop."""
-        for rows in (self._priors, self._departures, self._ties, self._bearings):
+        for rows in (self.priors, self.departures, self.ties, self.bearings):
             begin, end, _ = rows.columns
             rows.remove((begin == stop) | (end == stop))
 
-    @property
-    def bearing_count(self) -> int:
-        """Number of bearings."""
-        return self._bearings.count
-
-    def departures(self) -> Iterator[tuple[int, int, FloatArray]]:
-        """Stop of departure, of arrival, and turn, motion and sigmas, see `constraints.Departures`."""
-        begin, end, values = self._departures.columns
-        yield from zip(begin.tolist(), end.tolist(), values, strict=True)
-
     def linearised(self, states: FloatArray) -> list[Linearised]:
         """Linearize all constraints at states (k, 4)."""
-        stop, _, prior = self._priors.columns
-        begin, end, driven = self._departures.columns
-        first, last, tied = self._ties.columns
-        seer, seen, light = self._bearings.columns
         return [
-            priors(states, stop, prior[:, :3], prior[:, 3:]),
-            odometry(states, Departures(begin, end, driven[:, 0], driven[:, 1:4], driven[:, 4:])),
-            ties(states, Ties(first, last, tied[:, :3], tied[:, 3:].reshape(-1, 3, 3))),
-            bearings(states, Bearings(seer, seen, *light.T)),
+            priors(states, *self.priors.columns),
+            odometry(states, *self.departures.columns),
+            ties(states, *self.ties.columns),
+            bearings(states, *self.bearings.columns),
         ]
 
 
@@ -421,7 +398,7 @@ class PoseGraph:
     def drop_stop(self, stop: int) -> None:
         """Take back all that a stop tells; its number and its place stay."""
         self._disconnect(stop)
-        self.constraints.add_prior(stop, self.states[stop, :3].copy(), np.ones(3))
+        self.constraints.priors.add(stop, stop, self.states[stop, :3], np.ones(3))
         self.turned[stop] = self._turned_all[stop] = self._beams.counts[stop] = 0
         self.fit(stop)
 
@@ -452,7 +429,7 @@ class PoseGraph:
         """Change the slip of a robot at some or all of its stops, which move as by odometry."""
         moved = set(np.flatnonzero(self.robot[: self.count] == robot).tolist() if stops is None else stops)
         self.states[list(moved), 3] -= change
-        for begin, end, row in self.constraints.departures():
+        for begin, end, row in zip(*self.constraints.departures.columns, strict=True):
             if begin in moved and end in moved:
                 x, y, theta, ratio = self.states[begin]
                 self.states[end, :3] = compose(np.array([x, y, theta + ratio * row[0]]), row[1:4])
@@ -469,11 +446,6 @@ class PoseGraph:
         ratio = self._fitted_ratio[stop] = self.states[stop, 3]
         fit_lines(stop, ratio, self._beams.reach[stop], self._beams, self._lines)
 
-    def overlap(self, stop: int, other: int) -> float:
-        """Share of the beams of a stop that fit the lines of another."""
-        matched, tried, _ = agreement(self.scans, stop, other, 0.0, _OVERLAP_STRIDE)
-        return matched / max(1, tried)
-
     def distances(self, stop: int) -> FloatArray:
         """Distances (count,) of all stops from one stop [m]."""
         off = self.states[: self.count, :2] - self.states[stop, :2]
@@ -486,7 +458,8 @@ class PoseGraph:
         for other in np.argsort(away, kind="stable"):
             if away[other] > 0.88 * self._beams.reach[stop] or len(found) == limit:
                 break
-            if other != stop and self.overlap(stop, int(other)) > least:
+            matched, tried, _ = agreement(self.scans, stop, other, 0.0, _OVERLAP_STRIDE)
+            if other != stop and matched > least * max(1, tried):
                 found.append(int(other))
         return found
 
@@ -541,7 +514,12 @@ class PoseGraph:
             stride: Every `stride`-th beam is used.
         """
         equations = NormalEquations(free)
-        equations.add(self._linearised())
+        states, robot = self.states[: self.count], self.robot[: self.count]
+        turns = np.maximum(self._turned_all[: self.count], 1.0) / (2.0 * math.pi)
+        sigma = np.maximum(self.settings.turn_noise / np.sqrt(turns), _MIN_RATIO_SIGMA)
+        equations.add(self.constraints.linearised(states))
+        equations.add([ratios(states, self.slip, robot, sigma)])
+        equations.add([slips(self.count, self.slip, self.settings.usual_slip, self.settings.slip_sigma)])
         self._add_matches(equations, free[: STOP_UNKNOWNS * self.count : STOP_UNKNOWNS], gate, stride)
         return equations
 
@@ -568,16 +546,6 @@ class PoseGraph:
         self.states[:count] += change
         self.slip = self.slip + step[STOP_UNKNOWNS * count :]
         return bool((np.abs(change[:, :3]).max(axis=0, initial=0.0) < _SMALL_STEP).all())
-
-    def _linearised(self) -> list[Linearised]:
-        states, robot = self.states[: self.count], self.robot[: self.count]
-        turns = np.maximum(self._turned_all[: self.count], 1.0) / (2.0 * math.pi)
-        sigma = np.maximum(self.settings.turn_noise / np.sqrt(turns), _MIN_RATIO_SIGMA)
-        return [
-            *self.constraints.linearised(states),
-            ratios(states, self.slip, robot, sigma),
-            slips(self.count, self.slip, self.settings.usual_slip, self.settings.slip_sigma),
-        ]
 
     def _add_matches(self, equations: NormalEquations, moves: BoolArray, gate: float, stride: int) -> None:
         pairs, weights = [], []

@@ -35,7 +35,8 @@ _FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
 """Of the places around these, and of those after each drive [m, rad], and their number to each side."""
 _STEP_COST = 0.002  # What a squared step costs: where the map tells little, odometry is followed
 _HYPOTHESES = 100  # Maximum number of places
-_RULED_OUT = 0.5  # By how many scans a place explains less than another one if it is ruled out by it
+_RULED_OUT, _OVERTAKEN = 0.5, 0.15
+"""By how many scans another place explains more than one that is ruled out, and than one that was found."""
 _FITS, _CONTRADICTS = 0.88, 0.7
 """Share of the known beams that must fit the places where a robot is found, at all stops, and to keep it."""
 _MIN_KNOWN = 0.4  # Minimum share of beams of which the map says something
@@ -118,7 +119,7 @@ class Search:
     def is_contradicted(self) -> bool:
         """Whether the place that was found does not explain what the robot sees, or another does better."""
         total = self._totals()
-        return bool(self._contradicts()[self.found]) or bool(total.max() - total[self.found] > _RULED_OUT)
+        return bool(self._contradicts()[self.found]) or bool(total.max() - total[self.found] > _OVERTAKEN)
 
     @property
     def is_over(self) -> bool:

@@ -221,7 +221,7 @@ class SweepMap:
         elif len(points) >= _MIN_POINTS:
             self.refused.append(node)
             odometry = np.maximum(odometry, [0.1 + 0.3 * path, 0.1 + 0.3 * path, _PREDICTED_TURN])
-        self._graph.constraints.add_departure(begin, node, 0.0, motion, odometry)
+        self._graph.constraints.departures.add(begin, node, 0.0, motion, odometry)
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
@@ -390,7 +390,7 @@ class SweepMap:
         # the pose by both
         best = moved - given @ np.linalg.solve(given + covariance, off)
         graph.states[node, :3] = compose(before, best)
-        graph.constraints.add_tie(begin, node, tied, root_of(covariance))
+        graph.constraints.ties.add(begin, node, tied, root_of(covariance))
         return odometry
 
     def _close_loops(self, chain: Chain, node: int) -> None:
@@ -478,7 +478,8 @@ class SweepMap:
         shift = compose(pose, inverse(graph.states[node, :3]))
         mine = np.flatnonzero(graph.robot[: graph.count] == graph.robot[node])
         graph.states[mine, :3] = compose(shift, graph.states[mine, :3])
-        graph.constraints.remove_priors(set(mine.tolist()))
+        priors = graph.constraints.priors
+        priors.remove(np.isin(priors.columns[0], mine))
         chain.floats, chain.pending = False, []
         self.believe(agree)
 
@@ -544,7 +545,7 @@ class SweepMap:
         states, slip = graph.states[: graph.count].copy(), graph.slip.copy()
         squares = [_square(one, graph.states) for one in new]
         for one in new:
-            graph.constraints.add_tie(one.begin, one.end, one.pose, one.root)
+            graph.constraints.ties.add(one.begin, one.end, one.pose, one.root)
             self._ways.add(one.begin, one.end, 0.1)
         self.loops += new
         self._unsolved += len(new)
@@ -558,8 +559,10 @@ class SweepMap:
     def _take_back(self, ties: list[LoopTie]) -> None:
         """Remove ties."""
         self.taken_back += len(ties)
+        rows = self._graph.constraints.ties
         for one in ties:
-            self._graph.constraints.remove_tie(one.begin, one.end)
+            first, last, _ = rows.columns
+            rows.remove((first == one.begin) & (last == one.end))
             self._ways.cut(one.begin, one.end)
             self.loops.remove(one)
 

@@ -169,7 +169,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         graph = self._mapper.graph
         values: dict[str, object] = {
             "stops": graph.count,
-            "bearings": graph.constraints.bearing_count,
+            "bearings": graph.constraints.bearings.count,
             **self._mapper.counters,
             **drop_values(self.feed.all_drops + self.feed.dropped_beams),
         }

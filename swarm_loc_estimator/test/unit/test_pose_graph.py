@@ -22,14 +22,14 @@ def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArra
     """Each kind of constraint with numbers of its own, as a function of states (4, 4) and slips (2,)."""
     motion, turn = rng.normal(0.0, 0.6, (3, 3)), rng.normal(0.0, 2.0, 3)
     sigma, robot = rng.uniform(0.01, 0.2, (3, 3)), np.array([0, 0, 1, 1])
-    departures = pose_graph.Departures(FIRST, SECOND, turn, motion, sigma)
-    ties = pose_graph.Ties(FIRST, SECOND, motion, rng.normal(0.0, 20.0, (3, 3, 3)))
-    bearings = pose_graph.Bearings(FIRST, SECOND, turn, motion[:, 2], sigma[:, 0])
+    departures = np.column_stack([turn, motion, sigma])
+    ties = np.column_stack([motion, rng.normal(0.0, 20.0, (3, 9))])
+    bearings = np.column_stack([turn, motion[:, 2], sigma[:, 0]])
     return {
-        "odometry": lambda s, _: pose_graph.odometry(s, departures),
-        "ties": lambda s, _: pose_graph.ties(s, ties),
-        "bearings": lambda s, _: pose_graph.bearings(s, bearings),
-        "priors": lambda s, _: pose_graph.priors(s, FIRST, motion, sigma),
+        "odometry": lambda s, _: pose_graph.odometry(s, FIRST, SECOND, departures),
+        "ties": lambda s, _: pose_graph.ties(s, FIRST, SECOND, ties),
+        "bearings": lambda s, _: pose_graph.bearings(s, FIRST, SECOND, bearings),
+        "priors": lambda s, _: pose_graph.priors(s, FIRST, FIRST, np.column_stack([motion, sigma])),
         "ratios": lambda s, slip: pose_graph.ratios(s, slip, robot, np.full(STOPS, 0.01)),
         "slips": lambda s, slip: pose_graph.slips(len(s), slip, 0.02, 0.03),
     }
@@ -90,9 +90,9 @@ def test_a_chain_is_as_unsure_as_its_odometry_adds_up() -> None:
     stops = [graph.add_stop(0, np.array([float(k), 0.0, 0.0]), 0.02) for k in range(5)]
     for stop in stops:
         graph.set_scan(stop, Scan(np.zeros(1), np.zeros(1)))
-    graph.constraints.add_prior(0, np.zeros(3), np.full(3, 1e-4))
+    graph.constraints.priors.add(0, 0, np.zeros(3), np.full(3, 1e-4))
     for begin, end in pairwise(stops):
-        graph.constraints.add_departure(begin, end, 0.0, np.array([1.0, 0.0, 0.0]), sigma)
+        graph.constraints.departures.add(begin, end, 0.0, np.array([1.0, 0.0, 0.0]), sigma)
     graph.solve(3)
     assert np.allclose(graph.poses[:, 0], range(5), atol=1e-9)
     deviations = np.sqrt(np.diag(graph.covariance(4)))
@@ -128,9 +128,9 @@ def test_a_wall_that_only_one_robot_sees_tells_nothing_of_where_the_other_is(see
             graph.set_scan(stop, Scan(turn, inverse))
             if part:
                 motion, unmoved = np.zeros(3), np.full(3, 1e-3)
-                graph.constraints.add_departure(stop - 1, stop, 0.0, motion, unmoved)
+                graph.constraints.departures.add(stop - 1, stop, 0.0, motion, unmoved)
             else:
-                graph.constraints.add_prior(stop, graph.states[stop, :3].copy(), np.full(3, sigma))
+                graph.constraints.priors.add(stop, stop, graph.states[stop, :3].copy(), np.full(3, sigma))
     graph.starts.update(range(4))
     graph.place[:4] = [0, 0, 2, 2]
     graph.targets = {stop: [other for other in range(4) if other != stop] for stop in range(4)}
