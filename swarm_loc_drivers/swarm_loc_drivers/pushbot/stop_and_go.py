@@ -113,8 +113,7 @@ class StopAndGo:
         poses = np.array([row[1:] for row in track])
         there = np.array([np.interp(0.0, since_ns, column) for column in poses.T])
         self.goals += 1
-<<<<<<< HEAD
-        self._goal_ns = goal.stamp_ns
+        self._goal_ns, self._is_lost = goal.stamp_ns, False
         # estimate the wheel slip from the headings of two fixes and the odometry between them
         heading, by_odometry = float(goal.pose[2]), float(there[2])
         if self._fixed is not None and abs(turned := by_odometry - self._fixed[1]) > _MIN_RATIO_TURN:
@@ -122,10 +121,6 @@ class StopAndGo:
             self.ratio = min(max(self.ratio + wrong / turned, _LOW_RATIO), _HIGH_RATIO)
         self._fixed = (heading, by_odometry)
         # turn to the goal, drive there, and scan
-=======
-        self._goal_ns, self._is_lost = goal.stamp_ns, False
-        self._learn_ratio(float(goal.pose[2]), float(there[2]))
->>>>>>> restarts
         way = goal.position - goal.pose[:2]
         length = math.hypot(way[0], way[1])
         self._moves.clear()
@@ -157,13 +152,8 @@ class StopAndGo:
                 if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
                     self._moves.append(_Turn(self._open_heading, self._settings.turn_rate, is_heading=True))
                 self._moves.append(_Drive(_BLIND_DRIVE))
-<<<<<<< HEAD
-            self._farthest = 0.0
-            self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
-=======
             self._farthest, self._is_lost = 0.0, True
-            self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
->>>>>>> restarts
+            self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
         return STILL
 
     def _remember(self, stamp_ns: int, pose: FloatArray) -> FloatArray:

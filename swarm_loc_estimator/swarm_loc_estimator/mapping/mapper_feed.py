@@ -26,10 +26,11 @@ from swarm_loc_estimator.mapping.messages import (
     decode_laser,
     decode_lights,
     decode_scan,
+    described_delay,
+    learned_delay,
     read_sweep,
 )
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, Scan, ScanStop
-from swarm_loc_estimator.sensors.lidar import described_delay, learned_delay
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot
 

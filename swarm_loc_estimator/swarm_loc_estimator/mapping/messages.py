@@ -1,6 +1,12 @@
 """Messages of the mapper: maps, laser distances and frequencies of lights.
 
-Sweeps of lidars: the beams of a LaserScan that are used, and where they end.
+Sweeps of lidars: the beams of a LaserScan that are used, where they end, and how old they are.
+
+A scan in a map shows where the robot was in the middle of its sweep. The motion from one scan to the next is
+compared with odometry, at each of many lags: where speed or turn rate changes, only the true one agrees. The
+lag is the state of a hidden Markov model, since a driver may fall behind at any time; a robot that drives
+straight on tells no lag from another but by the jump back at that moment. Poses are those of all lags
+together: what is not known of the lag makes them uncertain along the motion.
 """
 
 from __future__ import annotations
@@ -25,10 +31,24 @@ from swarm_loc_estimator.common.messages.cdr import (
 )
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.common.se2 import compose, transform_points
+from swarm_loc_estimator.common.se2 import between, compose, transform_points, wrap_angle
 from swarm_loc_estimator.swarm.error_models import LidarModel
+from swarm_loc_estimator.swarm.swarm import Robot
 
 MAX_CELLS = 4_000_000  # Maximum number of cells of a valid map
+# Of delays
+_STEP_S, _COUNT = 0.025, 25  # Lags that are compared
+_RIGHT, _CHANGES_PER_S = 0.9, 0.003  # Chance that the described delay is right, and rate of changes
+_NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does not have; error of odometry
+_BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
+_DOF = 4.0  # Errors have Student's distribution: wheels slip
+_GAP_NS = 4_000_000_000  # Scans farther apart are not compared
+_WILD, _NOISE_SHARE = 400.0, 0.1
+"""Squares from which odometry is wrong at any lag and tells nothing, and weight of one in its usual noise."""
+_BACKWARDS, _SURE_ORDER = -2.0, 4.0
+"""Log odds that the header says the order of the beams wrongly, at first and from which on it is known."""
+_NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
+_NOWHERE = np.full((3, 3), np.nan)
 
 
 class GridMessage(NamedTuple):
@@ -220,3 +240,101 @@ def read_sweep(
     distance = np.where(scan.ranges[used] > min(nothing, reach), math.inf, scan.ranges[used])
     angle = scan.angle_min + used.astype(float) * step
     return LidarSweep(begin_ns, round(1e9 * duration_s), beam_ns, angle, distance, reach)
+
+
+class DelayBelief(NamedTuple):
+    """What is known of the times of a lidar's beams, and its newest scan."""
+
+    lag_s: FloatArray  # (L,) how much older scans may be than described [s]
+    chance: FloatArray  # (L,) of each
+    stamp_ns: int  # Stamp of the scan
+    seen: FloatArray  # (3,) pose of the robot in the middle of the sweep, in `map`
+    covariance: FloatArray  # (3, 3) of this pose, by its own axes
+    track: FloatArray  # (L, 3) this pose by odometry, at each lag
+    backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
+    noise: float = 1.0  # Mean of recent squares: how much worse odometry is than assumed
+    #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
+    anchor: FloatArray = _NOWHERE
+
+    @property
+    def is_backwards(self) -> bool:
+        """Whether beams are certainly measured in the other order than described."""
+        return self.backwards > _SURE_ORDER
+
+    @property
+    def mean_s(self) -> float:
+        """Mean lag [s]."""
+        return float(self.chance @ self.lag_s)
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of the lag [s]."""
+        return math.sqrt(float(self.chance @ (self.lag_s - self.mean_s) ** 2))
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether the described delay is wrong."""
+        return bool(self.chance[np.abs(self.lag_s) <= _NEAR_S].sum() < _REFUTED)
+
+    def sentence(self, robot: Robot) -> str:
+        """How old the scans of a robot are, and what to describe."""
+        older = "older" if self.mean_s > 0.0 else "newer"
+        text = f"the scans of {robot.name} are {abs(self.mean_s):.2f} +- {self.sigma_s:.2f} s {older} than"
+        text += f" described: set lidar.delay_s to {robot.lidar.delay_s - self.mean_s:.2f}, or correct their"
+        return f"{text} stamps"
+
+
+def described_delay(delay_s: float) -> DelayBelief:
+    """The belief before the first scan; the described delay [s] is negative if scans are stamped late."""
+    before = min(_COUNT - 1, round(max(0.0, -delay_s) / _STEP_S))  # no scan is newer than its arrival
+    lag_s = _STEP_S * (np.arange(_COUNT, dtype=float) - before)
+    nothing = np.zeros(3), np.eye(3), np.zeros((_COUNT, 3))
+    return DelayBelief(lag_s, _delay_prior(lag_s), -_GAP_NS, *nothing)
+
+
+def _delay_prior(lag_s: FloatArray) -> FloatArray:
+    """Chances (L,) of lags without any scan."""
+    chance = np.full(_COUNT, (1.0 - _RIGHT) / (_COUNT - 1))
+    chance[np.argmin(np.abs(lag_s))] = _RIGHT
+    return chance
+
+
+def learned_delay(
+    before: DelayBelief, stamp_ns: int, seen: FloatArray, covariance: FloatArray, track: FloatArray
+) -> DelayBelief:
+    """The belief after another scan, of which `DelayBelief` tells the arguments; `covariance` is in `map`."""
+    turn, cos, sin = np.eye(3), math.cos(seen[2]), math.sin(seen[2])
+    turn[:2, :2] = [[cos, sin], [-sin, cos]]
+    own, chance, since_ns = turn @ covariance @ turn.T, before.chance, stamp_ns - before.stamp_ns
+    noisiness = before.noise
+    if 0 < since_ns < _GAP_NS:
+        # (L, L, 3) errors of the motion from a lag of the scan before to one of this scan
+        error = between(track, compose(before.track, between(before.seen, seen))[:, None])
+        slip = _SLIP * (chance @ between(before.track, track))
+        noise = _NEW * (own + before.covariance) + np.diag(slip**2)
+        squares = (error @ np.linalg.inv(noise) * error).sum(axis=-1)
+        usual = min(float(chance @ np.diag(squares)) / 3.0, _WILD)
+        noisiness = max(1.0, noisiness + _NOISE_SHARE * (usual - noisiness))
+        # a sweep that turned otherwise than at the likeliest lag was straightened wrongly
+        turned = np.gradient(np.unwrap(track[:, 2])) * (1e-9 * since_ns / _STEP_S)
+        bent = 1.0 + (_BENT * (turned - turned[chance.argmax()])) ** 2 / noise[2, 2]
+        # changes are rare, and more often to what is described
+        change = 1.0 - math.exp(-1e-9 * since_ns * _CHANGES_PER_S)
+        transition = (1.0 - change) * np.eye(_COUNT) + change * _delay_prior(before.lag_s)
+        chance = chance @ (
+            transition * (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
+        )
+        chance = chance / chance.sum() if squares.min() < _WILD else before.chance
+    return before._replace(
+        chance=chance, stamp_ns=stamp_ns, seen=seen, covariance=own, track=track, noise=noisiness
+    )
+
+
+def at_odometry(belief: DelayBelief, now: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The pose (3,) in `map` at a pose (3,) by odometry, and its covariance (3, 3) by the lag alone."""
+    poses = compose(belief.seen, between(belief.track, now))
+    off = poses - poses[0]
+    off[:, 2] = wrap_angle(off[:, 2])
+    mean = belief.chance @ off
+    off -= mean
+    return poses[0] + mean, (belief.chance * off.T) @ off

@@ -259,36 +259,7 @@ class ConstraintLists:
     """
 
     def __init__(self) -> None:
-<<<<<<< HEAD
-        self._priors, self._departures, self._ties, self._bearings = map(PairRows, (6, 7, 12, 3))
-
-    def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
-        """Add a prior on the pose (3,) of a stop with standard deviations (3,)."""
-        self._priors.add(stop, stop, pose, sigma)
-
-    def add_departure(self, begin: int, end: int, turn: float, motion: FloatArray, sigma: FloatArray) -> None:
-        """Add odometry from stop to stop, see `constraints.Departures`."""
-        self._departures.add(begin, end, turn, motion, sigma)
-
-    def add_tie(self, begin: int, end: int, pose: FloatArray, root: FloatArray) -> None:
-        """Add a relative pose, see `Ties`."""
-        self._ties.add(begin, end, pose, root.ravel())
-
-    def add_bearing(self, begin: int, end: int, turn: float, bearing: float, sigma: float) -> None:
-        """Add the bearing of a robot's light at another stop, see `constraints.Bearings`."""
-        self._bearings.add(begin, end, turn, bearing, sigma)
-
-    def remove_priors(self, stops: Collection[int]) -> None:
-        """Remove the priors of stops."""
-        self._priors.remove(np.isin(self._priors.columns[0], list(stops)))
-
-    def remove_tie(self, begin: int, end: int) -> None:
-        """Remove the ties of two stops."""
-        first, last, _ = self._ties.columns
-        self._ties.remove((first == begin) & (last == end))
-=======
-        self.priors, self.departures, self.ties, self.bearings = map(_Rows, (6, 7, 12, 3))
->>>>>>> restarts
+        self.priors, self.departures, self.ties, self.bearings = map(PairRows, (6, 7, 12, 3))
 
     def remove_stop(self, stop: int) -> None:
         """Remove all constraints on a stop."""

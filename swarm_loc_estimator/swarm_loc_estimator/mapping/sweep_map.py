@@ -308,14 +308,13 @@ class SweepMap:
                 root = root_of(_turned(found.covariance, -there[2]))
                 self._refined.append(LoopTie(other, node, between(there, found.pose), root, 0.0))
         for one in self._refined:
-            graph.constraints.add_tie(*one[:4])
+            graph.constraints.ties.add(*one[:4])
         if self._refined:
             graph.solve(3)
             self._drop_refined([one for one in self._refined if _square(one, graph.states) > _CONTRADICTS])
 
     def _drop_refined(self, ties: list[LoopTie]) -> None:
-        for one in ties:
-            self._graph.constraints.remove_tie(one.begin, one.end)
+        self._untie(ties)
         self._refined = [one for one in self._refined if one not in ties]
 
     def doubts(self) -> FloatArray:
@@ -557,14 +556,17 @@ class SweepMap:
             self._take_back(new)
 
     def _take_back(self, ties: list[LoopTie]) -> None:
-        """Remove ties."""
         self.taken_back += len(ties)
+        self._untie(ties)
+        for one in ties:
+            self._ways.cut(one.begin, one.end)
+            self.loops.remove(one)
+
+    def _untie(self, ties: list[LoopTie]) -> None:
         rows = self._graph.constraints.ties
         for one in ties:
             first, last, _ = rows.columns
             rows.remove((first == one.begin) & (last == one.end))
-            self._ways.cut(one.begin, one.end)
-            self.loops.remove(one)
 
 
 def _window(motion: FloatArray) -> PoseWindow:

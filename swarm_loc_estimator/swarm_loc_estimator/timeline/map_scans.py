@@ -33,10 +33,9 @@ from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
 from swarm_loc_estimator.filter.state import SwarmState, robot_columns
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError
-from swarm_loc_estimator.mapping.messages import LidarSweep
+from swarm_loc_estimator.mapping.messages import LidarSweep, at_odometry, described_delay, learned_delay
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.lidar import at_odometry, described_delay, learned_delay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings

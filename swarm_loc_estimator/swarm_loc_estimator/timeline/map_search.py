@@ -29,7 +29,7 @@ from swarm_loc_estimator.filter.sources import CONFIRMED
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map
-from swarm_loc_estimator.sensors.lidar import described_delay
+from swarm_loc_estimator.mapping.messages import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,

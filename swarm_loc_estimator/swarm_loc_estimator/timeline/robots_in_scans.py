@@ -20,9 +20,8 @@ from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurement
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.identification.picture import UNSEEN, Picture, assign, log_ratios
-from swarm_loc_estimator.mapping.messages import LidarSweep
+from swarm_loc_estimator.mapping.messages import LidarSweep, described_delay
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
-from swarm_loc_estimator.sensors.lidar import described_delay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.map_scans import MapScans, are_near_walls

@@ -8,7 +8,7 @@ from core_geometry import nees, wrapped
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import compose, exp
-from swarm_loc_estimator.sensors.lidar import DelayBelief, at_odometry, described_delay, learned_delay
+from swarm_loc_estimator.mapping.messages import DelayBelief, at_odometry, described_delay, learned_delay
 
 PERIOD_S, COVARIANCE = 0.2, np.diag([0.01, 0.01, 0.005]) ** 2
 START = np.array([2.0, -1.0, 2.5])
