@@ -392,9 +392,9 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     # errors over time, root mean square of all seeds and tracked robots
     plots = []
     for name, case in cases.items():
-        tracked = np.array([result.status == Status.TRACKED for result in case.results])
-        total = np.where(tracked, np.array(case.squared), 0.0).sum(axis=(0, 2))
-        shown = {"tracked robots": 100.0 * np.sqrt(total / np.maximum(tracked.sum(axis=(0, 2)), 1))}
+        is_tracked = np.array([result.status == Status.TRACKED for result in case.results])
+        total = np.where(is_tracked, np.array(case.squared), 0.0).sum(axis=(0, 2))
+        shown = {"tracked robots": 100.0 * np.sqrt(total / np.maximum(is_tracked.sum(axis=(0, 2)), 1))}
         if name in bound_of:
             shown["bound"] = 100.0 * np.sqrt(np.mean(bound_of[name], axis=(0, 2)))
         time_s = (1 + np.arange(len(total))) * TICK_STEPS * STEP_NS * 1e-9

@@ -4,8 +4,10 @@ from swarm_loc_estimator.filter.measurements import Measurements as Measurements
 from swarm_loc_estimator.filter.models import Prediction as Prediction
 from swarm_loc_estimator.infrared.brightness import expected_brightness as expected_brightness
 from swarm_loc_estimator.mapping.exploration import Goal as Goal
+from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP as LOG_ODDS_CAP
 from swarm_loc_estimator.mapping.grid import OccupancyMap as OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map as load_map
+from swarm_loc_estimator.mapping.map_file import save_map as save_map
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN as SCAN_TURN
 from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
@@ -26,6 +28,7 @@ from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
 from swarm_loc_estimator.sensors.aerial import AerialRows as AerialRows
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE as CONTENT_POSE
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO as CONTENT_POSE_TWO
+from swarm_loc_estimator.sensors.camera import FROM_OPTICAL as FROM_OPTICAL
 from swarm_loc_estimator.sensors.camera import DetectionRows as DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows as FixRows
 from swarm_loc_estimator.sensors.imu import TurnRateRows as TurnRateRows

@@ -23,10 +23,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.poses import encode_fix
+from swarm_loc_estimator.common.messages.poses import HEADING_UNKNOWN, encode_fix
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.common.parameters import number, text, texts
-from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _TRACK_M = 0.081  # `TRACK_EFFECTIVE_MM` of dotbot/kinematics.py

@@ -34,12 +34,13 @@ from swarm_loc_estimator.offline.recorded_bag import Progress, same_type
 from swarm_loc_estimator.offline.survey.survey import place_fixed
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, NO_DETECTIONS
 from swarm_loc_estimator.sensors.inputs import TRUTH, kinds
-from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BodyPose
+from swarm_loc_estimator.sensors.localizers import SOURCES, BodyPose
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.swarm.error_models import ClockModel, FixModel, OdometryModel, RandomWalk
 from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrPlatform, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.new_swarm import GYROSCOPE, KNOWN_ROBOTS, LIDAR
 from swarm_loc_estimator.swarm.swarm import (
+    BODY,
     Anchor,
     Face,
     Landmark,

@@ -106,7 +106,7 @@ def _draw_free(
 
 
 CELL = 0.02  # Size of a cell as in the PushBot paper [m]
-LOG_ODDS_CAP = 5.0  # Maximum absolute log odds of a cell
+LOG_ODDS_CAP = 5.0  #: Maximum absolute log odds of a cell
 _OCCUPIED, _FREE = 0.45, -0.2
 
 

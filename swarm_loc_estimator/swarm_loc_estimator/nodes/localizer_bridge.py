@@ -20,7 +20,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
-from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BridgeParameters, LocalizedRobots
+from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots
+from swarm_loc_estimator.swarm.swarm import BODY
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _INPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -13,15 +12,13 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_FIXES
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
-from swarm_loc_estimator.common.messages.poses import decode_fix
+from swarm_loc_estimator.common.messages.poses import HEADING_UNKNOWN, decode_fix
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, MODELS
 from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings, SharedTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-HEADING_UNKNOWN = math.pi**2
-"""Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
 NO_COVARIANCE = "fix_without_covariance"
 """Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
 _FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))

@@ -18,12 +18,17 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.common.messages import cdr
-from swarm_loc_estimator.common.messages.poses import PLANE, encode_fix, encode_pose_stamped, yaw_of
+from swarm_loc_estimator.common.messages.poses import (
+    HEADING_UNKNOWN,
+    PLANE,
+    encode_fix,
+    encode_pose_stamped,
+    yaw_of,
+)
 from swarm_loc_estimator.common.parameters import ParameterError, text
-from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
-from swarm_loc_estimator.swarm.swarm import Localizer
+from swarm_loc_estimator.sensors.fix import has_heading, is_unknown
+from swarm_loc_estimator.swarm.swarm import BODY, BODY_TOPIC, Localizer
 
-BODY = "<body>"  # Stands for the name of a body in a topic
 _UNKNOWN: FloatArray = np.zeros((3, 3))
 
 
@@ -77,7 +82,7 @@ def _of_poses(message: Any, poses: str = "", name: str = "") -> Iterator[BodyPos
 
 
 SOURCES: Mapping[str, LocalizerSource] = {
-    "pose": LocalizerSource(cdr.POSE_STAMPED, f"/vrpn_mocap/{BODY}/pose", _of_poses),
+    "pose": LocalizerSource(cdr.POSE_STAMPED, BODY_TOPIC, _of_poses),
     "pose_with_covariance": LocalizerSource(
         cdr.POSE_WITH_COVARIANCE, f"{BODY}/amcl_pose", _of_pose_with_covariance
     ),

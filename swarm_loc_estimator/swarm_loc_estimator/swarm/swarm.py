@@ -221,6 +221,8 @@ class MarkerOwner:
 
 LOCALIZERS = ("pose", "pose_with_covariance", "odometry", "tf", "named_poses", "rigid_bodies")
 """Kinds of messages of localizers, see `sensors/localizers.py`."""
+BODY = "<body>"  # Stands for the name of a body in a topic
+BODY_TOPIC = f"/vrpn_mocap/{BODY}/pose"  # Default of the source `pose`
 
 
 @dataclass(frozen=True)

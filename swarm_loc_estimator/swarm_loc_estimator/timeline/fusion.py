@@ -39,7 +39,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
-from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
+from swarm_loc_estimator.timeline.map_scans import FoundPlace, MapScans, Sweeps
 from swarm_loc_estimator.timeline.map_search import MapSearch, described_map
 from swarm_loc_estimator.timeline.robots_in_scans import RobotsInScans
 from swarm_loc_estimator.timeline.settings import Settings
@@ -196,14 +196,10 @@ class Fusion:
                 verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
         if state.map is None or not state.tracked[robot]:
             return
-        scan = self._scans.matched(state, one.row(0), sweep)
-        found = self._search.regained(state, scan)
-        if found is not None:
-            self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
-            verdicts[:] = Verdict.USED
-            return
-        fix, verdicts[:], confirms = self._scans.fix_of(state, scan)
-        if fix is not None:
+        fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep, self._search.around)
+        if isinstance(fix, FoundPlace):
+            self._set_pose(state, robot, stamp_ns, fix.pose, fix.covariance)
+        elif fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()
             self._fuse(state, fix, verdicts, nis)
             if not confirms:

@@ -16,7 +16,7 @@ Errors that whole walls share remain for any number of pieces, and are added to 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +33,13 @@ from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
 from swarm_loc_estimator.filter.state import SwarmState, robot_columns
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError
-from swarm_loc_estimator.mapping.messages import LidarSweep, at_odometry, described_delay, learned_delay
+from swarm_loc_estimator.mapping.messages import (
+    DelayBelief,
+    LidarSweep,
+    at_odometry,
+    described_delay,
+    learned_delay,
+)
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -348,24 +354,17 @@ _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
+_GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
+DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
+SoughtAround = Callable[..., "FoundPlace | None"]  # As `MapSearch.around`
 
 
-class MatchedScan(NamedTuple):
-    """A scan matched where its robot is predicted."""
+class FoundPlace(NamedTuple):
+    """The place where a robot is."""
 
-    robot: int
-    stamp_ns: int
-    walls: WallMap  # With the error of its lidar's map
-    beams: tuple[FloatArray, FloatArray, FloatArray]  # Ends, origin and variances, see `match`
-    predicted: FloatArray  # (3,) pose
-    covariance: FloatArray  # (3, 3) of it
-    found: Match
-    track: FloatArray  # (L, 3) poses by odometry in the middle of the sweep, at each lag
-    back: FloatArray  # (3,) from the pose at its stamp to that in the middle, at the likeliest lag
-    anchor: FloatArray  # (3, 3) of `DelayBelief`, if it is where it was matched
-    reported: FloatArray | None  # (3,) pose by a motion that odometry has left out, if it has
-    follows: bool  # Whether it was matched where the scan before and odometry put it
+    pose: FloatArray  # (3,)
+    covariance: FloatArray  # (3, 3)
 
 
 class MapScans:
@@ -380,15 +379,16 @@ class MapScans:
         """The map with the error that the description of a robot says."""
         return walls._replace(variance=walls.variance + self._lidars[robot].map_sigma ** 2)
 
-    def matched(self, state: SwarmState, one: Measurements, sweep: LidarSweep) -> MatchedScan:
-        """Match a scan where its robot is predicted.
+    def fix_of(
+        self, state: SwarmState, one: Measurements, sweep: LidarSweep, sought: SoughtAround
+    ) -> tuple[Measurements | FoundPlace | None, Verdict, bool]:
+        """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a start.
 
-        Args:
-            state: With a map; what is known of the order of beams is changed.
-            one: Row of the scan, whose robot is located in the map.
-            sweep: Its beams that may end at walls.
+        `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
+        `sought`, see `MapSearch.around`, and returned. Fault scores of the state, which has a map, and what
+        is known of the times of the beams are changed.
         """
-        robot, stamp_ns = int(one.target), int(one.stamp_ns)
+        robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
         pose, covariance = estimate.poses[robot], estimate.covariances[robot]
         walls = self.walls_of(state.map.walls, robot)
@@ -411,40 +411,26 @@ class MapScans:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
         # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
-        sample = self.tracks.at(np.array([robot]), np.array([stamp_ns]))
-        reported: FloatArray | None = None
-        follows = False
-        anchor = np.stack([found.pose, now, sample.raw[0]])
-        if not np.isnan(delay.anchor).any():
-            motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
-            motions[:, 2] = wrap_angle(motions[:, 2])
-            seen, used, moved = motions
-            path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
-            slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
-            follows = bool((np.abs(seen - used) < slack).all())
-            limits = self._limits.position_sigma, self._limits.position_sigma, self._limits.heading_sigma
-            is_unknown = (np.diag(covariance) > np.square(_NEARLY_LOST * np.array(limits))).any()
-            if is_unknown or (np.abs(moved - used) > slack).any():
-                reported = compose(delay.anchor[0], moved)
-        return MatchedScan(
-            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported, follows
-        )
-
-    def fix_of(self, state: SwarmState, scan: MatchedScan) -> tuple[Measurements | None, Verdict, bool]:
-        """The fix (1,) of a scan, or None and why there is none, and whether it confirms a start.
-
-        Fault scores of `state` are changed.
-        """
-        robot, stamp_ns, found, driven = scan.robot, scan.stamp_ns, scan.found, 0.0
-        delay = state.delays[robot]
+        anchor = np.stack([found.pose, now, self.tracks.at(np.array([robot]), np.array([stamp_ns])).raw[0]])
+        reported, follows = self._left_out(delay, anchor, covariance)
+        fits = found.outcome in (FITS, FAR) and found.fitting >= SURE_FIT
+        away = squared_distance(found.pose, pose, covariance + found.covariance)
+        is_known = reported is not None or (follows and fits and away > _GATED)
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
+        if confirmed and (is_known or not fits):
+            least = SURE_FIT if is_known else max(SURE_FIT, found.fitting + DECLINE)
+            place = sought(state.map._replace(walls=walls), *beams, pose, covariance, reported, least)
+            if place is not None:
+                anchor[0] = place.pose
+                state.delays[robot] = delay._replace(anchor=anchor, stamp_ns=-1)
+                return place, Verdict.USED, False
+        # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
             if delay.stamp_ns > 0:
                 best = int(delay.chance.argmax())
-                driven = math.dist(delay.track[best, :2], scan.track[best, :2])
-            seen = compose(found.pose, scan.back)
-            delay = learned_delay(delay, stamp_ns, seen, found.covariance, scan.track)
-            delay = state.delays[robot] = delay._replace(anchor=scan.anchor)
+                driven = math.dist(delay.track[best, :2], track[best, :2])
+            delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
+            delay = state.delays[robot] = delay._replace(anchor=anchor)
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
             if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
@@ -454,15 +440,35 @@ class MapScans:
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED, False
         state.sources.score[robot] = max(0.0, state.sources.score[robot] - 4.0 * RELIEF)
-        # walls err otherwise where it is now than where it was: the error that it shares with them fades
-        fading = 2.0 * _SYSTEMATIC_SHARE * scan.walls.variance * min(1.0, driven / _ALIKE_M)
+        # Walls err otherwise where it is now than where it was: the error that it shares with them fades.
+        fading = 2.0 * _SYSTEMATIC_SHARE * walls.variance * min(1.0, driven / _ALIKE_M)
         state.filter.add(robot_columns(np.array([robot]))[0], np.diag([fading, fading, 0.0]))
-        pose, doubt = at_odometry(delay, scan.anchor[1])
-        fix = about_robots(robot, stamp_ns, pose[None], (found.covariance + doubt)[None], CARTESIAN)
+        seen, doubt = at_odometry(delay, now)
+        fix = about_robots(robot, stamp_ns, seen[None], (found.covariance + doubt)[None], CARTESIAN)
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
-        # with a second solution it locates no robot alone: it was sought near the pose that may be wrong
+        # With a second solution it locates no robot alone: it was sought near the pose that may be wrong.
         fix.has_second[:], fix.second[:] = True, fix.value
         return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= SURE_FIT
+
+    def _left_out(
+        self, delay: DelayBelief, anchor: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray | None, bool]:
+        """The pose (3,) by a motion that odometry has left out; whether the scan follows the one before.
+
+        It does if it is matched where that one and odometry put it. `anchor` (3, 3) is that of `DelayBelief`.
+        """
+        if np.isnan(delay.anchor).any():
+            return None, False
+        motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
+        motions[:, 2] = wrap_angle(motions[:, 2])
+        seen, used, moved = motions
+        path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
+        slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
+        limits = self._limits.position_sigma, self._limits.position_sigma, self._limits.heading_sigma
+        is_unknown = (np.diag(covariance) > np.square(_NEARLY_LOST * np.array(limits))).any()
+        has_left_out = is_unknown or (np.abs(moved - used) > slack).any()
+        reported = compose(delay.anchor[0], moved) if has_left_out else None
+        return reported, bool((np.abs(seen - used) < slack).all())
 
     def sweep_of(self, one: Measurements) -> LidarSweep | None:
         """The sweep of a row of a scan; None: it is not kept any more."""
@@ -488,3 +494,10 @@ class MapScans:
         ends = sweep.ends(lidar, between(poses[beams], poses[:beams]))[seen]
         sigma = lidar.range_sigma + lidar.range_sigma_per_m * sweep.distance[seen]
         return (ends, np.array([lidar.x, lidar.y]), sigma**2), poses[beams], poses[beams + 1 :]
+
+
+def squared_distance(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
+    """Squared distance of two poses (3,), in variances (3, 3)."""
+    off = other - pose
+    off[2] = wrap_angle(off[2])
+    return float(off @ np.linalg.solve(covariance, off))

@@ -25,7 +25,6 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
-from swarm_loc_estimator.filter.sources import CONFIRMED
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map
@@ -33,17 +32,17 @@ from swarm_loc_estimator.mapping.messages import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
-    FAR,
+    DECLINE,
     FITS,
     FREE,
     OFF_MAP,
-    SURE_FIT,
     WALL,
+    FoundPlace,
     MapScans,
     Match,
-    MatchedScan,
     WallMap,
     match,
+    squared_distance,
     wall_map,
 )
 
@@ -62,15 +61,12 @@ _SLIP = (0.03, 0.02, 0.06)  # Error of such a drive [m], of its turn [rad], and 
 _RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another that rules it out
 _LOOKS, _MEMORY = 3, 8  # Minimum number of looks, and maximum number that are compared
 _MIN_FIT = 0.7  # Share of the beams that must fit, on average
-_DECLINE = 0.07
-"""How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
 _AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
 """Least and greatest steps in which a located robot is sought around its prediction [m, m, rad]."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
-_GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 _SAME = np.diag(np.square([0.05, 0.05, 0.03]))
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
@@ -142,13 +138,6 @@ class PossiblePlaces(NamedTuple):
         return len(self.looks) >= _LOOKS and len(self.transform) >= least
 
 
-class FoundPlace(NamedTuple):
-    """A place that was found."""
-
-    pose: FloatArray  # (3,) of the robot
-    covariance: FloatArray  # (3, 3)
-
-
 def search_map(walls: WallMap) -> SearchMap:
     """Prepare a map."""
     away = scipy.ndimage.distance_transform_edt(walls.kind != WALL) * walls.cell
@@ -218,44 +207,54 @@ class MapSearch:
         state.places[robot] = places
         return None, _why_nowhere(places)
 
-    def regained(self, state: SwarmState, scan: MatchedScan) -> FoundPlace | None:
+    @staticmethod
+    def around(
+        known: SearchMap,
+        ends: FloatArray,
+        origin: FloatArray,
+        variance: FloatArray,
+        predicted: FloatArray,
+        covariance: FloatArray,
+        reported: FloatArray | None,
+        least: float,
+    ) -> FoundPlace | None:
         """The place of a robot that is not where it was predicted; None: it is, or nobody knows.
 
         Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
         counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
+
+        Args:
+            known: The map.
+            ends: (n, 2) of its beams, see `match`.
+            origin: (2,) of them.
+            variance: (n,) of them.
+            predicted: (3,) pose.
+            covariance: (3, 3) of it.
+            reported: (3,) pose by a motion that odometry has left out, if it has.
+            least: Share of the beams that must fit.
         """
-        # whether it is where it was predicted
-        square = _squared(scan.found.pose, scan.predicted, scan.covariance + scan.found.covariance)
-        fits = scan.found.outcome in (FITS, FAR) and scan.found.fitting >= SURE_FIT
-        is_known = scan.reported is not None or (scan.follows and fits and square > _GATED)
-        if state.sources.confirmations[scan.robot] < CONFIRMED or (fits and not is_known):
-            return None
         # places around the prediction, and around what odometry reports
-        beams = SweptBeams.thinned(*scan.beams)
+        beams = SweptBeams.thinned(ends, origin, variance)
         points = _spread(beams.ends)
-        sigma = np.clip(np.sqrt(np.diag(scan.covariance)), *_AROUND)
-        if scan.reported is not None:  # what is left out may be the whole turn
+        sigma = np.clip(np.sqrt(np.diag(covariance)), *_AROUND)
+        if reported is not None:  # what is left out may be the whole turn
             sigma = _AROUND[0]
-        centres = [one for one in (scan.predicted, scan.reported) if one is not None]
+        centres = [one for one in (predicted, reported) if one is not None]
         poses = (np.array(centres)[:, None] + _OFFSETS * sigma).reshape(-1, 3)
-        known = state.map._replace(walls=scan.walls)
         score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
         order = _largest(score, len(score))
         kept = order[_separate(poses[order], score[order], _NEAR_BY)]
         # the one that explains the scan, if no other does
-        found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
+        found = [match(known.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
         found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
-        least = SURE_FIT if is_known else max(SURE_FIT, scan.found.fitting + _DECLINE)
         if not found or found[0].fitting < least:
             return None
         best = found[0]
         for other in found[1:]:
-            square = _squared(best.pose, other.pose, best.covariance + other.covariance + _SAME)
-            if square > _RIVAL and other.fitting > best.fitting - _DECLINE:
+            square = squared_distance(best.pose, other.pose, best.covariance + other.covariance + _SAME)
+            if square > _RIVAL and other.fitting > best.fitting - DECLINE:
                 return None
         information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
-        anchor = np.stack([best.pose, *scan.anchor[1:]])
-        state.delays[scan.robot] = state.delays[scan.robot]._replace(anchor=anchor, stamp_ns=-1)
         return FoundPlace(best.pose, np.linalg.inv(information))
 
     def _add(
@@ -304,7 +303,7 @@ class MapSearch:
             return after if is_look else before, None
         if not after.is_complete:
             return self._advanced(after, PlaceSearch(), known), None
-        if after.fits[0, 0] - after.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
+        if after.fits[0, 0] - after.fits[0, 1:].mean() > DECLINE:  # the first fits wrong places best
             return nowhere, None
         return after, FoundPlace(best.pose, best.covariance + _START)
 
@@ -486,10 +485,3 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     each: IntArray = order[_separate(poses[order], total[order] + 1e-9, len(order))]
     kept: IntArray = each[total[each] > total.max(initial=0.0) - _RULED_OUT]
     return kept
-
-
-def _squared(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
-    """Squared distance of two poses (3,), in variances."""
-    off = other - pose
-    off[2] = wrap_angle(off[2])
-    return float(off @ np.linalg.solve(covariance, off))

@@ -18,18 +18,17 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.common.messages.cdr import POSE_STAMPED, decode, encode
-from swarm_loc_estimator.common.messages.poses import planar_covariance
+from swarm_loc_estimator.common.messages.poses import HEADING_UNKNOWN, planar_covariance
 from swarm_loc_estimator.common.parameters import ParameterError, UserError
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN
 from swarm_loc_estimator.sensors.inputs import input_topics
-from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BridgeParameters, LocalizedRobots, RobotPose
+from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots, RobotPose
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.swarm import Anchor, Localizer, Robot, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm import BODY, Anchor, Localizer, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings

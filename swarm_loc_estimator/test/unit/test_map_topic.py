@@ -125,15 +125,16 @@ def test_a_located_robot_stays_and_one_that_is_searched_begins_anew(seed: int) -
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_robot_in_a_map_that_has_moved_is_lost_and_found_in_the_new_one(seed: int) -> None:
+def test_a_robot_in_a_map_that_has_moved_is_soon_lost_or_found_in_the_new_one(seed: int) -> None:
     drawn = room_map(CELL)
     moved = ("map", 3 * SECOND, map_bytes(replace(drawn, corner=drawn.corner + MOVED)))
     messages = [("map", 0, map_bytes(drawn)), *sent(16 * SECOND, seed), moved]
     estimates = hand_in(Estimator(by_topic()), sorted(messages, key=lambda one: one[1]))
-    assert Status.WAITING in [one.status[0] for one in estimates if one.stamp_ns > 3 * SECOND]
-    assert estimates[-1].status[0] == Status.TRACKED
-    error = wrapped(estimates[-1].poses[0] - LidarRobot().pose(16 * SECOND) - [*MOVED, 0.0])
-    assert np.abs(error).max() < 2.0 * CELL
+    tracked = [one for one in estimates if one.stamp_ns > 3.5 * SECOND and one.status[0] == Status.TRACKED]
+    assert tracked[-1] is estimates[-1]
+    for one in tracked:
+        error = wrapped(one.poses[0] - LidarRobot().pose(one.stamp_ns) - [*MOVED, 0.0])
+        assert np.abs(error).max() < 2.0 * CELL
 
 
 def test_scans_that_come_late_are_matched_in_the_map_of_their_time() -> None:

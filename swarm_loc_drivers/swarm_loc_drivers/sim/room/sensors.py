@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_drivers.sim.pushbot.floor_plan import ray_distance
 from swarm_loc_drivers.sim.room.world import VIEW, RoomWorld
 from swarm_loc_drivers.sim.worlds import WorldError
-from swarm_loc_estimator import CONTENT_POSE
+from swarm_loc_estimator import CONTENT_POSE, FROM_OPTICAL
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
@@ -39,9 +39,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_pose_stamped,
     position_and_quaternion,
 )
-from swarm_loc_estimator.sensors.camera import FROM_OPTICAL
-from swarm_loc_estimator.sensors.localizers import BODY, SOURCES
-from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, UwbDevice
+from swarm_loc_estimator.swarm.swarm import BODY, BODY_TOPIC, Anchor, Face, FixedCamera, UwbDevice
 
 Message = tuple[str, bytes]  # Topic, serialized message
 
@@ -322,7 +320,7 @@ class MotionCapture(SimulatedSensor):
             name: np.array([float(number) for number in numbers.split(",")])
             for name, _, numbers in (one.partition("=") for one in localizer.offsets)
         }
-        pattern = localizer.topic or SOURCES["pose"].topic
+        pattern = localizer.topic or BODY_TOPIC
         names = [robot.name for robot in swarm.robots if robot.name in bodies or not bodies]
         self._robots = [swarm.index_of[name] for name in names]
         return [pattern.replace(BODY, bodies.get(name, name)).lstrip("/") for name in names]

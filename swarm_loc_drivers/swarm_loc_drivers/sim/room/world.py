@@ -18,11 +18,10 @@ from swarm_loc_drivers.sim.differential_drive import Drive, integrate, roll, twi
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan, kept_clear, polygon, ray_distance
 from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
+from swarm_loc_estimator import LOG_ODDS_CAP, OccupancyMap, load_map, save_map
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import choice, text
-from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
-from swarm_loc_estimator.mapping.map_file import load_map, save_map
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 STEP_NS = 10_000_000

@@ -21,6 +21,8 @@ from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, CdrError, dec
 
 POSE_DOUBLES = 7  # Numbers of a geometry_msgs/Pose: position and quaternion
 PLANE = np.ix_((0, 1, 5), (0, 1, 5))  # Where x, y and yaw stand in a 6x6 covariance
+HEADING_UNKNOWN = math.pi**2
+"""Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
 STAMP_SIZE = 8
