@@ -119,7 +119,7 @@ def simulate_gyroscopes(rng: np.random.Generator, run: LivedRun, imu: ImuModel) 
     arrivals = arrival_ns(rng, stamps, CAMERA_LATENESS)
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
     unknown = np.full(velocity.shape, np.nan)
-    rows = TurnRateRows(robots, stamps, velocity, unknown[:, 0], arrivals, unknown)
+    rows = TurnRateRows(robots, stamps, velocity, unknown[:, 0], unknown, arrivals)
     return in_order_of_arrival([rows])
 
 

@@ -34,7 +34,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("robots", [1, 2, 20])
 def test_robots_begin_apart(robots: int) -> None:
-    places = starts(DropletRunSettings(robots=robots))[:, :2]
+    places = starts(1, robots)[:, :2]
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.eye(robots)
     assert apart.min() > 0.6 * PITCH
     assert np.ptp(places, axis=0).max() < 0.2 * np.sqrt(robots)

@@ -31,11 +31,11 @@ class TurnRateRows(NamedTuple):
     velocity: FloatArray  #: (k, 3) angular velocity in the frame of the IMU [rad/s]
     #: (k,) turn rate about the vertical, without calibration [rad/s]; before the conversion NaN, -inf: none
     rate: FloatArray
-    arrival_ns: IntArray  #: (k,) arrival times
     up: FloatArray  #: (k, 3) the vertical in the frame of the IMU, by its orientation; NaN: not known
+    arrival_ns: IntArray  #: (k,) arrival times
 
 
-NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS, np.zeros((0, 3)))
+NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), NO_ROWS)
 
 
 class TurnRateSensor(Sensor):
@@ -64,7 +64,7 @@ class TurnRateSensor(Sensor):
         has_none = [message.angular_velocity_covariance[0] == -1.0 for message in messages.decoded]
         rate = np.where(has_none, -np.inf, np.nan)
         up = np.array([_vertical(message) for message in messages.decoded], dtype=float).reshape(-1, 3)
-        return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, messages.arrival_ns, up)
+        return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, up, messages.arrival_ns)
 
     def measure(self, rows: TurnRateRows) -> TurnRateRows:
         """Select finite turn rates of robots with an IMU, turned to the vertical."""

@@ -390,7 +390,7 @@ def with_radios_and_gyroscopes(recording: Recording, swarm: Swarm, seed: int) ->
     robot_index, stamps, rate = (np.concatenate(column) for column in zip(*turns, strict=True))
     order = np.argsort(stamps, kind="stable")
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
-    columns = [one[order] for one in (robot_index, stamps, velocity, rate, stamps, velocity)]
+    columns = [one[order] for one in (robot_index, stamps, velocity, rate, velocity, stamps)]
     turned = TurnRateRows(*columns)
     robots = tuple(
         replace(one, uwb=UwbDevice(k, range_sigma=0.2), imu=ImuModel(turn_noise_density=0.02))

@@ -219,7 +219,7 @@ def test_the_mount_is_taken_into_account(roll: float, pitch: float, rate: float)
     velocity = mount.T @ [0.0, 0.0, rate]
     one = np.zeros(1, dtype=np.int64)
     unknown = np.full((1, 3), np.nan)
-    rows = TurnRateRows(one, one + T0, velocity[None], unknown[:, 0], one + T0, unknown)
+    rows = TurnRateRows(one, one + T0, velocity[None], unknown[:, 0], unknown, one + T0)
     sensor = TurnRateSensor(Swarm((Robot("r0", imu=imu),)), Settings(), DropCounts(1))
     converted = sensor.measure(rows)
     assert converted.rate[0] == pytest.approx(rate, abs=1e-9)

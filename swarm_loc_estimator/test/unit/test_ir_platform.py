@@ -194,7 +194,11 @@ def test_a_file_may_be_named_by_a_path_from_here(tmp_path: Path, monkeypatch: py
         ("angles: [", "angles: [] # ", "angles has 0 elements"),
         ("angles: [-0.523598776,", "angles: [1.570796327,", "no two elements may coincide."),
         ("below: 0.6186", "below: 0.5", "sensor.pieces do not meet at 0.5 rad"),
-        ("[-1.0, 4]]}", "[-1.0]]}", "emitter.pieces[0].terms[2] is"),
+        (
+            "[-1.0, 4]]}\n    - {terms: [[0.25",
+            "[-1.0]]}\n    - {terms: [[0.25",
+            "emitter.pieces[0].terms[2] is",
+        ),
         ("  far:", "  fare:", "'powers.fare' is not a known key; the nearest one is 'far'."),
         ("nearest: 0.035", "nearest: 0.01", "powers.far.nearest is 0.01 m but must be beyond the pole"),
         ("{scale: 0.1, offset: 0.006,", "{", "powers.near lacks scale, a number in (0, 1e+09]"),

@@ -391,10 +391,6 @@ def _quietly(work: Callable[[], object]) -> None:
         return
 
 
-if __name__ == "__main__":
-    json.dump(compiled_late(cast("Size", sys.argv[1])), sys.stdout)
-
-
 BAG = Path(__file__).parents[3] / "bags" / "pushbots_two"
 FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}
 
@@ -422,7 +418,8 @@ def compiled_late_mapper_precompile() -> list[str]:
 
 
 if __name__ == "__main__":
-    json.dump(compiled_late_mapper_precompile(), sys.stdout)
+    late = compiled_late(cast("Size", sys.argv[1])) if sys.argv[1:] else compiled_late_mapper_precompile()
+    json.dump(late, sys.stdout)
 
 
 PACKAGE = Path(__file__).parents[2]

@@ -375,7 +375,7 @@ def test_gyroscopes_replace_the_turns_of_wheels() -> None:
     turns = np.gradient(np.unwrap(world.truth[:, 0, 2]), 1e-9 * world.stamp_ns.astype(float))
     none = np.zeros((turns.size, 3))
     rates = TurnRateRows(
-        np.zeros(turns.size, dtype=np.int64), world.stamp_ns, none, turns + 0.02, world.stamp_ns, none
+        np.zeros(turns.size, dtype=np.int64), world.stamp_ns, none, turns + 0.02, none, world.stamp_ns
     )
     imu = ImuModel(turn_noise_density=0.002, turn_bias_sigma=0.02, turn_bias_time_s=100.0)
     described = replace(swarm, robots=(replace(swarm.robots[0], imu=imu),))

@@ -302,7 +302,7 @@ def test_turns_of_gyroscopes_replace_those_of_wheels() -> None:
     turned = replace(
         recording,
         odometry=rows._replace(pose=straight),
-        turn_rates=TurnRateRows(own, stamp_ns, nothing, rate, stamp_ns, nothing),
+        turn_rates=TurnRateRows(own, stamp_ns, nothing, rate, nothing, stamp_ns),
     )
     imu = ImuModel(turn_noise_density=1e-3, timeout_s=1.0)
     with_imu = tuple(replace(one, imu=imu) for one in world.swarm.robots)

@@ -302,7 +302,11 @@ def test_memory_stays_bounded_over_a_long_run() -> None:
                 estimator.tick(moved.stamp_ns)
         line = estimator._timeline
         sizes.append(
-            (estimator._tracks.arrays.stamp_ns.shape[1], len(line._checkpoints), line.measurements.size)
+            (
+                estimator._tracks.arrays.stamp_ns.shape[1],
+                len(line._checkpoints),
+                line._buffer.measurements.size,
+            )
         )
     assert len({size[0] for size in sizes}) == 1
     assert max(size[1] for size in sizes) <= 45
