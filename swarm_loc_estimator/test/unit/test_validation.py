@@ -305,7 +305,7 @@ def test_memory_stays_bounded_over_a_long_run() -> None:
             (
                 estimator._tracks.arrays.stamp_ns.shape[1],
                 len(line._checkpoints),
-                line._buffer.measurements.size,
+                len(line.buffer),
             )
         )
     assert len({size[0] for size in sizes}) == 1
