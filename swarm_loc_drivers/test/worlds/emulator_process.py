@@ -30,11 +30,15 @@ class EmulatorProcess:
     """
 
     def __init__(self, script: str, *arguments: str) -> None:
+        path = os.pathsep.join(
+            [str(HERE.parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+        )  # for `bench`
         self._process = subprocess.Popen(
             [sys.executable, str(HERE / script), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            env={**os.environ, "PYTHONPATH": path},
         )
         self.place = self._line()
 
