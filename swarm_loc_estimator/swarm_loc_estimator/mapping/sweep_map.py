@@ -298,7 +298,8 @@ class SweepMap:
     def _tie_revisits(self) -> None:
         graph, tied = self._graph, {frozenset(one[:2]) for one in self.loops}
         self._drop_refined(self._refined)
-        nodes = np.flatnonzero((self._points.counts[: graph.count] >= _MIN_POINTS) & ~self.floating())
+        nodes = np.flatnonzero(self._points.counts[: graph.count] >= _MIN_POINTS)
+        nodes = nodes[~self.floating()[nodes]]  # stops of robots without a lidar have no points
         for node, other, points, known in self._revisits(nodes, _DOUBT_NEAR):
             found = match(known, points, graph.states[node, :3], _REFINED)
             is_sure = found.score >= _LOOP_SCORE and _ridge(found.covariance) < _LOOP_RIDGE

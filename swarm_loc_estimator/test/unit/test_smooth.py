@@ -297,8 +297,8 @@ def run(recording: Recording, swarm: Swarm) -> ReplayResult:
     return runner.result(recording.name, recording.range_ns, recording.truth, {})
 
 
-@pytest.mark.parametrize("moved", [0.0, 0.06])
-def test_a_landmark_that_is_opened_online_is_so_in_the_batch_if_it_has_moved(moved: float) -> None:
+def test_a_landmark_that_has_moved_and_is_opened_online_is_so_in_the_batch() -> None:
+    moved = 0.06
     squares = {name: list[float]() for name in ("exact", "opened", "as it is")}
     for seed in range(2):
         world = simulate(PLAN, seed)
@@ -312,11 +312,8 @@ def test_a_landmark_that_is_opened_online_is_so_in_the_batch_if_it_has_moved(mov
             error, _ = errors_of(smooth_recording(recording, online), world)
             squares[name] += np.sum(error[:, :2] ** 2, axis=1).tolist()
     exact, found, right = (float(np.mean(one)) for one in squares.values())
-    if moved:
-        assert found < 0.5 * (exact + right)
-        assert found < 1.3 * right
-    else:
-        assert found == pytest.approx(exact, rel=1e-3)
+    assert found < 0.5 * (exact + right)
+    assert found < 1.3 * right
 
 
 def test_covariances_are_those_of_many_worlds() -> None:

@@ -24,7 +24,6 @@ from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots, Parameter, opened, problem_of
 from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
-from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.inputs import kinds
@@ -36,7 +35,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
 MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
@@ -44,7 +43,6 @@ MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
 _FIXED = 1e-6  # Standard deviation of a parameter that is exact
 _CONTRADICTED = 0.5  # Weight below which the batch contradicts a measurement
 _CONTRADICTING = 0.15  # Share of the measurements of a robot or camera from which they contradict the others
-_MOVED = 16.3  # Squared distance from its described place from which a landmark was moved: 99.9 % [sigma^2]
 _USED = {"odometry", "imu", "detections", "fixes", "ranges"}  # Sensors
 _WITHOUT_FRAME = "it has no start, landmark or fix, so its poses are relative to a robot"
 
@@ -111,17 +109,10 @@ def smooth_recording(
         raise SmoothError(recording.name, "no robot was located online")
     start = Start(nowhere, np.array(places).reshape(-1, 3), knot)
     problem = counted_once(problem)
-    # the solution; landmarks are opened only if they are not in their places by it, too
+    # the solution
     prior = ParameterPrior(np.zeros_like(sigma), sigma)
     solver = Solver(problem, start, prior)
     solution = solver.solve(progress)
-    if swarm.landmarks != online.swarm.landmarks:
-        lasting = with_lasting_errors(problem, solution.knot, solution.landmark)
-        closed = _closed(online.swarm, solver.with_noise_of(lasting))
-        problem = replace(problem, swarm=replace(swarm, landmarks=closed))
-    if problem.swarm.landmarks != swarm.landmarks:
-        solver = Solver(problem, replace(start, knot=solution.knot, parameter=solution.parameter), prior)
-        solution = solver.solve(progress)
     # unless it contradicts much of a source
     sources = problem.sightings.received_from
     for index, source in enumerate(swarm.sources):
@@ -169,17 +160,6 @@ def _opened(online: ReplayResult) -> Swarm:
     return replace(
         online.swarm, robots=tuple(replace(one, uwb=now.uwb) for one, now in robots), landmarks=marks
     )
-
-
-def _closed(described: Swarm, solution: Solution) -> tuple[Landmark, ...]:
-    """The landmarks, as described where the solution has not moved them."""
-    marks = []
-    for index, mark in enumerate(described.landmarks):
-        off = solution.landmark[index] - (mark.x, mark.y, mark.yaw or 0.0)
-        off[2] = se2.wrap_angle(off[2]) if mark.yaw is not None else 0.0
-        far = nees(off[None], solution.landmark_covariance[index][None])[0]
-        marks.append(solution.problem.swarm.landmarks[index] if far > _MOVED else mark)
-    return tuple(marks)
 
 
 def _unsure(swarm: Swarm, learned: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
