@@ -16,7 +16,6 @@ from swarm_loc_estimator.offline.batch.problem import (
     BatchProblem,
     all_changed,
     calibrated_parameters,
-    opened,
     problem_of,
     values_of,
 )
@@ -146,7 +145,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 
     Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
     and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
-    are more rounds, and landmarks may be a little off, lest their errors seem to be those of wheels there.
+    are more rounds.
 
     Raises:
         CalibrationError: Too little is known about the poses of robots.
@@ -160,8 +159,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
             f" drive; without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or anchors, or"
             " of other robots."
         )
-    current = replace(swarm, landmarks=tuple(map(opened, swarm.landmarks)))
-    current = started_at_truth(swarm, recording) if truth else current
+    current = started_at_truth(swarm, recording) if truth else swarm
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
     seen, polar = begin.is_seen, begin.is_polar
