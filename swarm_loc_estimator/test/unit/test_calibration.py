@@ -335,7 +335,6 @@ def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int)
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
 
 
-@pytest.mark.timeout(300)  # fits two recordings, and halves of both
 @pytest.mark.parametrize("seed", [7, 8])
 def test_recordings_are_fitted_together(seed: int) -> None:
     """Robots are elsewhere in the second, where landmarks locate them; nothing is known between the two."""
