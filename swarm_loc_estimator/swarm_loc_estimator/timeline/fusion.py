@@ -198,7 +198,9 @@ class Fusion:
             return
         fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep, self._search.around)
         if isinstance(fix, FoundPlace):
-            self._set_pose(state, robot, stamp_ns, fix.pose, fix.covariance)
+            # where one scan alone has found it, others must agree before it is tracked
+            confirmations = sources.WELL_CONFIRMED if confirms else sources.CONFIRMED
+            self._set_pose(state, robot, stamp_ns, fix.pose, fix.covariance, confirmations)
         elif fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()
             self._fuse(state, fix, verdicts, nis)
@@ -397,7 +399,13 @@ class Fusion:
             self._set_pose(state, robot, stamp_ns, command.pose, command.covariance)
 
     def _set_pose(
-        self, state: SwarmState, robot: int, stamp_ns: int, pose: FloatArray, covariance: FloatArray
+        self,
+        state: SwarmState,
+        robot: int,
+        stamp_ns: int,
+        pose: FloatArray,
+        covariance: FloatArray,
+        confirmations: float = sources.WELL_CONFIRMED,
     ) -> None:
         """Set a robot to a pose (3,) in `map` with covariance (3, 3)."""
         track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
@@ -405,7 +413,7 @@ class Fusion:
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
         initial = InitialPose(transform, se2.error_covariance(pose, covariance))
         if state.origin == IN_MAP:
-            state.initialize(robot, initial, at, sources.WELL_CONFIRMED)
+            state.initialize(robot, initial, at, confirmations)
         else:
             self._local.move_to_map(state, robot, initial, at)
 

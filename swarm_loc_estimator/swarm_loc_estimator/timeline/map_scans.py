@@ -355,6 +355,7 @@ _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 _GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
+_SAME_PLACE_M = 0.1  # Shift of a pose up to which two scans in a row are enough to believe it
 DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
 SoughtAround = Callable[..., "FoundPlace | None"]  # As `MapSearch.around`
@@ -385,7 +386,8 @@ class MapScans:
         """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a start.
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
-        `sought`, see `MapSearch.around`, and returned. Fault scores of the state, which has a map, and what
+        `sought`, see `MapSearch.around`, and returned; a near one that two scans in a row tell needs no other to
+        confirm it. Fault scores of the state, which has a map, and what
         is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
@@ -423,7 +425,8 @@ class MapScans:
             if place is not None:
                 anchor[0] = place.pose
                 state.delays[robot] = delay._replace(anchor=anchor, stamp_ns=-1)
-                return place, Verdict.USED, False
+                is_near = math.dist(place.pose[:2], pose[:2]) < _SAME_PLACE_M
+                return place, Verdict.USED, follows and fits and is_near
         # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
             if delay.stamp_ns > 0:
