@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, Vector3
 from node_world import Ros, overrides
 
@@ -17,6 +18,7 @@ from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.dotbot.dotbot_node import DotbotNode, DotbotParameters, pose_of
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.messages.poses import planar_pose
+from swarm_loc_estimator.common.parameters import ParameterError
 
 DOTBOTS = [
     {
@@ -32,6 +34,7 @@ class Controller(BaseHTTPRequestHandler):
     """Answers as the controller does, and keeps what is put."""
 
     put: list[tuple[str, object]] = []  # noqa: RUF012
+    robots: object = DOTBOTS
 
     def _answer(self, body: object) -> None:
         self.send_response(200)
@@ -41,7 +44,7 @@ class Controller(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Tell the robots."""
         assert self.path == "/controller/dotbots"
-        self._answer(DOTBOTS)
+        self._answer(self.robots)
 
     def do_PUT(self) -> None:
         """Take a command."""
@@ -94,6 +97,91 @@ def test_poses_are_fixes_and_velocities_are_speeds_of_wheels(ros: Ros, tmp_path:
         {"left_mm_s": 60, "right_mm_s": 140},
     )
     assert not [one for one in fixes[0][1:] if one.header.stamp != fixes[0][0].header.stamp]  # nothing new
+
+
+@pytest.fixture
+def node(
+    ros: Ros,  # noqa: ARG001  # must run before
+    tmp_path: Path,
+    url: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> DotbotNode:
+    """The node of two robots, which has not asked yet."""
+    swarm_file = tmp_path / "swarm.yaml"
+    assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
+    monkeypatch.setattr(Controller, "robots", [])
+    return DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), url=url))
+
+
+@pytest.mark.parametrize(
+    ("about", "reason"),
+    [
+        ({"pose": {"x": math.nan, "y": 1.0}}, {"bad_answer": 1}),
+        ({"pose": {"x": "1", "y": 1.0}}, {"bad_answer": 1}),
+        ({"pose": {"y": 1.0}}, {"bad_answer": 1}),
+        ({"pose": [1.0, 2.0]}, {"bad_answer": 1}),
+        ({"pose": {"x": 1.0, "y": 1.0, "heading_deg": None, "heading_source": "ekf"}}, {"bad_answer": 1}),
+        ({"pose": {"x": 1.0, "y": 1.0, "heading_deg": math.inf, "heading_source": "ekf"}}, {"bad_answer": 1}),
+        ({}, {}),
+    ],
+)
+def test_a_bad_answer_is_dropped_and_counted_and_the_other_robot_is_heard(
+    ros: Ros,
+    node: DotbotNode,
+    monkeypatch: pytest.MonkeyPatch,
+    about: dict[str, object],
+    reason: dict[str, int],
+) -> None:
+    good = {"address": "B", "last_seen": 5.0, "pose": {"x": 100, "y": 200}}
+    monkeypatch.setattr(Controller, "robots", [{"address": "A", "last_seen": 5.0, **about}, good, "nonsense"])
+    fixes = [ros.listen(PoseWithCovarianceStamped, f"dotbot{k}/fix") for k in (1, 2)]
+    ros.add(node)
+    ros.until(lambda: fixes[1])
+    assert not fixes[0]
+    assert set(node.health.drops) == set(reason)
+
+
+@pytest.mark.parametrize("answer", [{"detail": "not found"}, None, "robots", [1, None]])
+def test_an_answer_that_is_no_list_of_robots_is_survived(
+    ros: Ros, node: DotbotNode, monkeypatch: pytest.MonkeyPatch, answer: object
+) -> None:
+    monkeypatch.setattr(Controller, "robots", answer)
+    states = ros.listen(DiagnosticArray, "/diagnostics")
+    fixes = ros.listen(PoseWithCovarianceStamped, "dotbot1/fix")
+    ros.add(node)
+    ros.until(lambda: any("no poses of dotbot1" in one.message for state in states for one in state.status))
+    monkeypatch.setattr(Controller, "robots", DOTBOTS)
+    ros.until(lambda: fixes)
+
+
+def test_a_robot_keeps_its_address_when_another_one_is_gone(
+    ros: Ros, node: DotbotNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Controller, "robots", DOTBOTS)
+    fixes = [ros.listen(PoseWithCovarianceStamped, f"dotbot{k}/fix") for k in (1, 2)]
+    ros.add(node)
+    ros.until(lambda: all(fixes))
+    before = len(fixes[0])
+    monkeypatch.setattr(Controller, "robots", [{**DOTBOTS[0], "last_seen": 6.0}])
+    ros.until(lambda: len(fixes[1]) > 1)
+    assert len(fixes[0]) == before
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"url": "file:///etc/passwd"}, "must begin with http:// or https://"),
+        ({"bodies": ["A=dotbot1", "B=robot7"]}, "parameter bodies names robot7, but the robots are dotbot1"),
+    ],
+)
+@pytest.mark.usefixtures("ros")
+def test_a_wrong_parameter_is_one_sentence(
+    tmp_path: Path, parameters: dict[str, object], sentence: str
+) -> None:
+    swarm_file = tmp_path / "swarm.yaml"
+    assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
+    with pytest.raises(ParameterError, match=sentence):
+        DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), **parameters))
 
 
 def test_the_page_has_all_parameters() -> None:

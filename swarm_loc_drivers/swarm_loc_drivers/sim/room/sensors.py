@@ -217,6 +217,8 @@ class Radios(SimulatedSensor):
         self._robots = [k for k, robot in enumerate(swarm.robots) if robot.uwb is not None]
         radios = [robot.uwb for robot in swarm.robots if robot.uwb is not None]
         self._devices: list[UwbDevice | Anchor] = [*radios, *swarm.anchors]
+        if len(self._devices) < 2:
+            return []
         self._bias = [one.range_bias for one in self._devices]
         self._bias += world.hidden(self._rng, [one.range_bias_sigma for one in self._devices])
         self._hidden = world.hidden(self._rng, [[one.position_sigma] * 2 for one in swarm.anchors])
@@ -314,6 +316,8 @@ class MotionCapture(SimulatedSensor):
             raise WorldError(
                 f"localizer.source is '{localizer.source}', and simulated motion capture has only 'pose'."
             )
+        self._stamp_late_ns = round(1e9 * localizer.latency_s)
+        self._late_ns += self._stamp_late_ns
         pairs = (one.partition("=") for one in localizer.bodies)
         bodies = {robot or body: body for body, _, robot in pairs}
         self._offsets = {
@@ -333,7 +337,7 @@ class MotionCapture(SimulatedSensor):
             offset = self._offsets.get(world.swarm.robots[k].name, np.zeros(3))
             sigma = localizer.position_sigma, localizer.position_sigma, localizer.heading_sigma
             pose = se2.compose(world.poses[k], offset) + self._noise(*sigma)
-            stamp_ns = np.array([world.now_ns - round(1e9 * localizer.latency_s)])
+            stamp_ns = np.array([world.now_ns + self._stamp_late_ns])
             yield topic, encode_pose_stamped(localizer.source_frame or "map", stamp_ns, pose[None])[0]
 
 
