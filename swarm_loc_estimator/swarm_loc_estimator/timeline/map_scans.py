@@ -386,9 +386,8 @@ class MapScans:
         """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a start.
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
-        `sought`, see `MapSearch.around`, and returned; a near one that two scans in a row tell needs no other to
-        confirm it. Fault scores of the state, which has a map, and what
-        is known of the times of the beams are changed.
+        `sought`, see `MapSearch.around`, and returned; a near one that two scans in a row tell is confirmed.
+        Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
