@@ -1,5 +1,6 @@
 """`new BAG` describes what a recording shows: the description replays, and what it says is right."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -58,7 +59,7 @@ def test_the_description_of_a_bag_replays_without_an_edit(
     assert main(["--yes", str(BAGS / bag), str(path)]) == 0
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("# ?")]
     assert [line[4 : 4 + len(one)] for line, one in zip(lines, asked, strict=True)] == asked
-    assert f"replay {BAGS / bag} --swarm {path}" in capsys.readouterr().out
+    assert f"replay {shlex.quote(str(BAGS / bag))} --swarm {path}" in capsys.readouterr().out
     assert replay_main([str(BAGS / bag), "--swarm", str(path), "--out", str(tmp_path / "out")]) == 0
     found, described = load_swarm(path), load_swarm(BAGS / bag / "swarm.yaml")
     assert [robot.name for robot in found.robots] == [robot.name for robot in described.robots]
