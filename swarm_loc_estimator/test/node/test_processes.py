@@ -47,8 +47,9 @@ def _fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         folder.mkdir(parents=True)
     marker.touch()
     os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "python").symlink_to(sys.executable)  # whose folder may have a space in its name
     for name, lines in PROGRAMS.items():
-        text = TAKES_SIGINT.format(sys.executable, lines.format(fifo=tmp_path / "fifo"))
+        text = TAKES_SIGINT.format(tmp_path / "python", lines.format(fifo=tmp_path / "fifo"))
         (programs / name).write_text(text, encoding="utf-8")
         (programs / name).chmod(0o755)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
