@@ -13,14 +13,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, FixedCamera, MapError, Robot, Surveyed
+from swarm_loc_estimator.common.se2 import compose, error_covariance
+from swarm_loc_estimator.swarm.swarm import (
+    NO_MAP_ERROR,
+    Anchor,
+    FixedCamera,
+    MapError,
+    Robot,
+    Surveyed,
+)
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -202,6 +210,39 @@ def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, F
     error = MapError(x, y, math.sqrt(shift), math.sqrt(spread[1, 1]), math.sqrt(spread[0, 0]))
     change = np.linalg.solve(np.linalg.cholesky(spread), change.T).T
     return error, moves @ change[: 3 * count].reshape(count, 3, 4), change[3 * count :]
+
+
+_LEAST_VARIANCE = 1e-8  # Of a place beyond the error that it shares, which may be all of it [m^2, rad^2]
+
+
+def moved_place(body: Surveyed, correction: FloatArray) -> FloatArray:
+    """Where a body is (3,) with the shift (3,) of an anchor, or the pose correction (3,) of others.
+
+    That is x, y and yaw, of an anchor the bias in place of the yaw.
+    """
+    if isinstance(body, Anchor):
+        return correction + np.array([body.x, body.y, body.range_bias])
+    return compose(correction, [body.x, body.y, body.yaw or 0.0])
+
+
+def found_at(body: Surveyed, place: FloatArray, covariance: FloatArray, shared: FloatArray) -> Any:
+    """A body where it was found; what was exact of an anchor stays so.
+
+    Args:
+        body: As it is described.
+        place: (3,) as by `moved_place`.
+        covariance: (3, 3) of the place.
+        shared: (3, 4) its errors by one standard deviation of what all places share.
+    """
+    variance = np.maximum(np.diag(covariance) - np.sum(shared**2, axis=1), _LEAST_VARIANCE)
+    (x, y, third), sigma = place.tolist(), math.sqrt(0.5 * float(variance[0] + variance[1]))
+    where: dict[str, Any] = {"x": x, "y": y, "position_sigma": sigma}
+    if isinstance(body, Anchor):
+        bias = {"range_bias": third, "range_bias_sigma": math.sqrt(variance[2])}
+        where = where if body.position_sigma > 0.0 else {}
+        return replace(body, **where, **(bias if body.range_bias_sigma > 0.0 else {}))
+    turned = {} if body.yaw is None else {"yaw": third, "yaw_sigma": math.sqrt(variance[2])}
+    return replace(body, **where, **turned)
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import composed, wrap
+from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.filter import sources
 from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.filter.models import ANY_HEADING
@@ -25,7 +26,9 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.calibration_states import moved_place
+from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.timeline.self_calibration import estimated_place
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -298,7 +301,11 @@ def contradictions(
             for one in sorted(state.delays)
             if state.delays[one].is_backwards
         ),
-        *(_description(names[source], source, state) for source in contradicted),
+        *(
+            one
+            for source in contradicted
+            if (one := _description(names[source], swarm, source, state)) is not None
+        ),
     ]
 
 
@@ -348,12 +355,24 @@ def _suspended(name: str) -> Contradiction:
     return Contradiction(name, Contradicted.SUSPENDED, text)
 
 
-def _description(name: str, source: int, state: SwarmState) -> Contradiction:
-    """Fault of a robot or landmark whose parameters are re-estimated."""
-    robots = state.tracked.size
-    if source < robots:
+def _description(name: str, swarm: Swarm, source: int, state: SwarmState) -> Contradiction | None:
+    """Fault of a robot or body whose parameters are re-estimated; None for a body that is where it should be.
+
+    What a body contradicted was the fault of another source, if its place has turned out right.
+    """
+    number = source - len(swarm.robots)
+    if number < 0:
         text = f"{name} contradicts its calibration; re-estimating its camera and odometry parameters"
-    else:
-        moved = float(np.hypot(*state.landmark[source - robots, :2]))
-        text = f"{name} is about {moved:.2f} m from its surveyed place; re-estimating its place"
+        return Contradiction(name, Contradicted.DESCRIPTION, text)
+    body = swarm.surveyed[number]
+    place, covariance = estimated_place(body, number, state)
+    off = place - moved_place(body, np.zeros(3))
+    off[2] = 0.0 if isinstance(body, Landmark) and body.yaw is None else wrap_angle(off[2])
+    if not np.any(np.abs(off) > _ELSEWHERE_SIGMAS * np.sqrt(np.diag(covariance))):
+        return None
+    moved = float(np.hypot(*off[:2]))
+    text = f"{name} is about {moved:.2f} m from its surveyed place; re-estimating its place"
     return Contradiction(name, Contradicted.DESCRIPTION, text)
+
+
+_ELSEWHERE_SIGMAS = 2.0  # Standard deviations by which a body is elsewhere

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -20,11 +19,11 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
+    found_at,
+    moved_place,
     shared_error,
 )
 from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, MapError, Robot, Surveyed, Swarm
-
-_LEAST_VARIANCE = 1e-8  # Of a place beyond the error that it shares, which may be all of it [m^2, rad^2]
 
 
 def learns(swarm: Swarm) -> bool:
@@ -39,7 +38,10 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. What places share of their errors is apart.
     """
     error, shared = _shared(swarm, state)
-    surveyed: list[Any] = [_placed(one, k, state, shared[k]) for k, one in enumerate(swarm.surveyed)]
+    surveyed: list[Any] = [
+        one if state.landmark_column(k) < 0 else found_at(one, *estimated_place(one, k, state), shared[k])
+        for k, one in enumerate(swarm.surveyed)
+    ]
     marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
     return replace(
         swarm,
@@ -52,6 +54,12 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
         anchors=tuple(surveyed[marks:anchors]),
         map_error=error,
     )
+
+
+def estimated_place(body: Surveyed, number: int, state: SwarmState) -> tuple[FloatArray, FloatArray]:
+    """Where a body is (3,) that is estimated, see `moved_place`, and the covariance (3, 3)."""
+    place, covariance = moved_place(body, state.landmark[number]), state.landmark_covariance(number)
+    return place, covariance if isinstance(body, Anchor) else se2.pose_covariance(place, covariance)
 
 
 def swapped_signs(swarm: Swarm) -> list[str]:
@@ -105,8 +113,8 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
 
 
 def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
-    """The error that places share, and variances (S, 3) of these by it; a sparse filter does not know it."""
-    variance = np.zeros((len(swarm.surveyed), 3))
+    """The error that places share, and errors (S, 3, 4) of these by it; a sparse filter does not know it."""
+    shared = np.zeros((len(swarm.surveyed), 3, 4))
     free_places = [
         state.landmark_column(k) >= 0 and one.position_sigma > 0.0 for k, one in enumerate(swarm.surveyed)
     ]
@@ -115,44 +123,9 @@ def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
     free, anchors = np.flatnonzero(is_free & ~is_shift), np.flatnonzero(is_free & is_shift)
     place = np.array([(swarm.surveyed[k].x, swarm.surveyed[k].y) for k in free]).reshape(-1, 2)
     if free.size < 2 or not np.ptp(place, axis=0).any() or not state.filter.is_dense:
-        return NO_MAP_ERROR, variance
+        return NO_MAP_ERROR, shared
     place = se2.transform_points(state.landmark[free], place)
     columns = [state.landmark_column(k) + np.arange(3) for k in (*free.tolist(), *anchors.tolist())]
     error, places, others = shared_error(place, state.filter.block(np.concatenate(columns)))
-    variance[free] = np.sum(places**2, axis=2)
-    variance[anchors] = np.sum(others**2, axis=1).reshape(-1, 3)
-    return error, variance
-
-
-def _calibrated(anchor: Anchor, number: int, state: SwarmState, shared: FloatArray) -> Anchor:
-    """An anchor with its estimated place and bias; what was exact stays so."""
-    (x, y, bias) = state.landmark[number].tolist()
-    variance = np.maximum(np.diag(state.landmark_covariance(number)) - shared, _LEAST_VARIANCE)
-    found: dict[str, Any] = {}
-    if anchor.position_sigma > 0.0:
-        sigma = math.sqrt(0.5 * (variance[0] + variance[1]))
-        found |= {"x": anchor.x + x, "y": anchor.y + y, "position_sigma": sigma}
-    if anchor.range_bias_sigma > 0.0:
-        sigma = math.sqrt(variance[2])
-        found |= {"range_bias": anchor.range_bias + bias, "range_bias_sigma": sigma}
-    return replace(anchor, **found)
-
-
-def _placed(mark: Surveyed, number: int, state: SwarmState, shared: FloatArray) -> Any:
-    """A landmark, anchor or fixed camera at its estimated place, if that is estimated."""
-    if state.landmark_column(number) < 0:
-        return mark
-    if isinstance(mark, Anchor):
-        return _calibrated(mark, number, state, shared)
-    x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
-    covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
-    variance = np.maximum(np.diag(covariance) - shared, _LEAST_VARIANCE)
-    moved: Any = mark
-    return replace(
-        moved,
-        x=x,
-        y=y,
-        yaw=None if mark.yaw is None else yaw,
-        position_sigma=math.sqrt(0.5 * float(variance[0] + variance[1])),
-        yaw_sigma=mark.yaw_sigma if mark.yaw is None else math.sqrt(float(variance[2])),
-    )
+    shared[free], shared[anchors] = places, others.reshape(-1, 3, 4)
+    return error, shared

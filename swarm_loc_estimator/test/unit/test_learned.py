@@ -1,5 +1,6 @@
 """What a run teaches of cameras, odometry and landmarks: near the truth, and good for the next run."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import marker_frame, seen, wrapped
-from core_messages import POSE, T0, detection
+from core_messages import POSE, SECOND, T0, detection
 from core_run import covariance_of_places, on_time, play, ticks
 from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
@@ -68,6 +69,27 @@ def true_landmarks(world: World) -> FloatArray:
     angles = 2.0 * np.pi * np.arange(PLAN.landmarks) / PLAN.landmarks
     assert len(world.swarm.landmarks) == PLAN.landmarks
     return PLAN.arena * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_landmark_is_named_while_it_is_elsewhere(seed: int) -> None:
+    """Somebody pushes it by 20 cm, and puts it back after ten seconds."""
+    world = simulate(Plan(3, 60.0, speed=0.15), seed)
+    mark, estimator, named = world.swarm.landmarks[2], Estimator(world.swarm), []
+    for second in range(60):
+        begin_ns, end_ns, events = T0 + second * SECOND, T0 + (second + 1) * SECOND, []
+        for event in (one for one in world.events if begin_ns <= one.stamp_ns < end_ns):
+            rows, heading = event.detections.copy(), world.at(event.stamp_ns)[event.robot, 2] + MOUNT.yaw
+            if 10 <= second < 20:
+                ahead, left = 0.2 * math.cos(heading), -0.2 * math.sin(heading)
+                rows["position"][rows["id"] == mark.id] += [-left, 0.0, ahead]
+            events.append((event.stamp_ns, replace(event, detections=rows)))
+        play(estimator, events, [end_ns])
+        about = [one.about for one in estimator.contradictions(end_ns)]
+        named.append([one for one in about if one.startswith("landmark")])
+    assert {one for names in named for one in names} == {f"landmark {mark.id}"}
+    assert named[19]
+    assert not named[59]
 
 
 def exact(swarm: Swarm) -> Swarm:

@@ -26,7 +26,8 @@ from swarm_loc_estimator.offline.batch.smooth import (
     smooth_recording,
     with_lasting_errors,
 )
-from swarm_loc_estimator.offline.batch.solver import Solver, Start, on_paths
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import unwatched

@@ -18,7 +18,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.batch.problem import SURVEY, problem_of
-from swarm_loc_estimator.offline.batch.solver import Solver, start_of
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, read_recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.survey.survey import survey

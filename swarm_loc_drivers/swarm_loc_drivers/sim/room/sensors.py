@@ -266,13 +266,13 @@ class CeilingCameras(SimulatedSensor):
     def _prepared(self) -> list[str]:
         world, swarm = self._world, self._world.swarm
         sigmas = [[one.position_sigma] * 2 + [one.yaw_sigma] for one in swarm.cameras]
-        self._off = world.hidden(self._rng, sigmas)
+        self.offsets = world.hidden(self._rng, sigmas)
         faces = [(k, face) for k, robot in enumerate(swarm.robots) for face in robot.faces if face.lies]
         self._faces: Sequence[tuple[int, Face]] = faces
         return [swarm.topic(camera.name, "detections") for camera in swarm.cameras]
 
     def _measure(self) -> Iterator[Message]:
-        for topic, camera, off in zip(self.topics, self._world.swarm.cameras, self._off, strict=True):
+        for topic, camera, off in zip(self.topics, self._world.swarm.cameras, self.offsets, strict=True):
             seen = [one for owned in self._faces if (one := self._seen(camera, off, *owned)) is not None]
             rows = blank_detections([face.id for face, _, _ in seen], CONTENT_POSE)
             for row, (face, place, turn) in zip(rows, seen, strict=True):

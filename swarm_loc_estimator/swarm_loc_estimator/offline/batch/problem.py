@@ -244,6 +244,11 @@ class BatchProblem:
         return np.asarray(self.sightings.model == POLAR)
 
     @property
+    def is_by_robot(self) -> BoolArray:
+        """Whether measurements (m,) are those of a robot."""
+        return np.asarray(self.sightings.observer >= 0)
+
+    @property
     def is_seen(self) -> BoolArray:
         """Whether measurements (m,) are sightings of places by a camera."""
         return is_compiled(self.sightings.model)
@@ -273,22 +278,23 @@ def problem_of(
     parameters: tuple[Parameter, ...] = (),
     truth: Mapping[str, Trajectory] | None = None,
     *,
-    ranged: bool = False,
+    fixed: bool = False,
     is_described: bool = False,
 ) -> BatchProblem:
     """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known.
 
-    Measurements are sightings by cameras of robots, of markers that belong to nobody, too, and if `ranged`
-    the ranges to anchors. Where all `is_described`, they are those of all sensors, and such markers are not
-    used.
+    Measurements are sightings by cameras of robots, of markers that belong to nobody, too, and if `fixed`
+    those by described cameras and the ranges to described anchors. Where all `is_described`, they are those
+    of all sensors, and such markers are not used.
     """
     # knots, and measurements by robots whose tracks are known then
     described, rare, seen = swarm, dict[int, int](), recording
     if not is_described:
         described, rare = _with_landmarks(recording, swarm)
-        described = replace(described, anchors=swarm.anchors if ranged else ())
+        if not fixed:
+            described = replace(described, anchors=(), cameras=())
         rows = recording.detections
-        wanted = ~np.isin(rows.detection["id"], list(rare)) & (rows.robot < len(swarm.robots))
+        wanted = ~np.isin(rows.detection["id"], list(rare)) & (rows.robot < len(described.sources))
         seen = replace(recording, detections=select(rows, wanted), fixes=NO_FIXES)
     tracks, sightings = _tracks(recording, swarm), _measured(seen, described)
     knots = _knots(tracks, recording, swarm, sightings, is_described)
@@ -448,7 +454,7 @@ def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int
         for marker_id in unknown
         if marker_id not in rare
     ]
-    return replace(swarm, landmarks=(*swarm.landmarks, *new), cameras=()), rare
+    return replace(swarm, landmarks=(*swarm.landmarks, *new)), rare
 
 
 def _knots(

@@ -22,7 +22,8 @@ from swarm_loc_estimator.filter.models import POLAR, is_compiled, predict_any
 from swarm_loc_estimator.filter.prediction import GROWTH
 from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots, Parameter, opened, problem_of
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, Start, on_paths
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
+from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult

@@ -3,13 +3,13 @@
 Errors are right-invariant, X = exp(xi) X_hat, as in the filter, whose measurement models and odometry noise
 are used. Weights of Geman and McClure of whole sightings limit the influence of wrong ids; they are wide at
 first, when places are far off (graduated non-convexity). Steps are those of Levenberg and Marquardt.
-They begin at paths that are known, or at joined maps of single robots in the frames of their tracks.
+They begin as `start.py` says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,172 +22,23 @@ from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Drift, innovation
+from swarm_loc_estimator.offline.batch.start import Start
 from swarm_loc_estimator.offline.recorded_bag import Progress
-from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
-
-_AGREES_M = 0.15
-"""Landmarks closer than this, or than a tenth of the distance between them, agree on an alignment."""
-
-
-@dataclass
-class Start:
-    """Where all begin."""
-
-    transform: FloatArray  # (N, 3) from the common frame to the track of each robot; NaN: not connected
-    landmark: FloatArray  # (L, 3) poses; NaN: not connected
-    knot: FloatArray | None = None  # (k, 3) transforms of tracks at knots, where paths are known
-    parameter: FloatArray | None = None  # (N, p) changes of parameters; None: the mean of their prior
-
-
-def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:
-    """Begin where robots are by paths in `map`; others as by `start_of`."""
-    start = start_of(problem)
-    return replace(start, knot=on_paths(problem, paths, start.transform))
-
-
-def on_paths(problem: BatchProblem, paths: Mapping[str, Trajectory], transform: FloatArray) -> FloatArray:
-    """Transforms (k, 3) of tracks at knots, by paths in `map`; those of robots (N, 3) without one."""
-    knots = problem.knots
-    knot = transform[knots.robot]
-    for index, robot in enumerate(problem.swarm.robots):
-        own, path = np.flatnonzero(knots.robot == index), paths.get(robot.name)
-        if path is None or not path.stamp_ns.size:
-            continue
-        track = problem.odometry.at(np.full(path.stamp_ns.size, index), path.stamp_ns).pose
-        middle = path.stamp_ns[:-1] + np.diff(path.stamp_ns) // 2
-        nearest = np.searchsorted(middle, knots.stamp_ns[own])
-        knot[own] = se2.compose(path.pose, se2.inverse(track))[nearest]
-    return knot
-
-
-def start_of(problem: BatchProblem) -> Start:
-    """Join the maps of all robots that share landmarks or see each other.
-
-    Begins with described landmarks and starts, else with the robot that has seen most landmarks, whose first
-    pose is then the origin.
-    """
-    swarm = problem.swarm
-    maps = [_map_of(problem, robot) for robot in range(len(swarm.robots))]
-    start = Start(np.full((len(swarm.robots), 3), np.nan), np.full((len(swarm.surveyed), 3), np.nan))
-    start.landmark[len(swarm.landmarks) :] = 0.0  # of anchors, the shift and bias
-    for index in np.flatnonzero(problem.is_known[: len(swarm.landmarks)]).tolist():
-        mark = swarm.landmarks[index]
-        start.landmark[index] = (mark.x, mark.y, mark.yaw or 0.0)
-    for index, robot in enumerate(swarm.robots):
-        if robot.start is not None and (problem.knots.robot == index).any():
-            _place(problem, start, maps, index, _at_first(problem, index, np.array(robot.start)))
-    if np.isnan(start.transform).all() and not problem.is_known.any():
-        seen = [int(np.isfinite(one).all(axis=1).sum()) for one in maps]
-        root = int(np.argmax(seen))
-        _place(problem, start, maps, root, _at_first(problem, root, np.zeros(3)))
-    while True:
-        waiting = np.flatnonzero(np.isnan(start.transform[:, 0])).tolist()
-        found = [(robot, *_alignment(problem, start, maps, robot)) for robot in waiting]
-        found = [one for one in found if one[2] > 0.0]
-        if not found:
-            return start
-        robot, transform, _ = max(found, key=lambda one: one[2])
-        _place(problem, start, maps, robot, transform)
-
-
-def _at_first(problem: BatchProblem, robot: int, pose: FloatArray) -> FloatArray:
-    """The transform of a robot's track with a pose (3,) at its first knot."""
-    first = int(np.flatnonzero(problem.knots.robot == robot)[0])
-    return se2.compose(pose, se2.inverse(problem.knots.sample.pose[first]))
-
-
-def _map_of(problem: BatchProblem, robot: int) -> FloatArray:
-    """Poses (L, 3) of the landmarks that a robot has seen, in the frame of its track; NaN: not seen."""
-    sightings, places = problem.sightings, np.full((len(problem.swarm.surveyed), 3), np.nan)
-    rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0) & problem.is_seen)
-    seen = _seen_at(problem, rows, problem.tracks[0, rows])
-    for index in np.unique(sightings.landmark[rows]).tolist():
-        own = seen[sightings.landmark[rows] == index]
-        x, y = np.median(own[:, :2], axis=0)
-        heading = own[np.isfinite(own[:, 2]), 2]
-        places[index] = (x, y, _median_angle(heading) if heading.size else 0.0)
-    return places
-
-
-def _seen_at(problem: BatchProblem, rows: IntArray, observer: FloatArray) -> FloatArray:
-    """Poses (k, 3) of the markers of sightings by robots at poses (k, 3); heading NaN: not seen."""
-    some, is_polar = select(problem.sightings, rows), problem.is_polar[rows]
-    value = some.value.copy()
-    distance, bearing = value[is_polar, 0].copy(), value[is_polar, 1].copy()
-    value[is_polar, 0], value[is_polar, 1] = distance * np.cos(bearing), distance * np.sin(bearing)
-    seen = se2.compose(se2.compose(observer, some.sensor), value)
-    seen[~some.has_heading, 2] = np.nan
-    return seen
-
-
-def _median_angle(angles: FloatArray) -> float:
-    """The angle whose distance to all others is least in sum."""
-    some = angles[:: max(1, angles.size // 200)]
-    return float(some[np.argmin(np.abs(se2.wrap_angle(some[:, None] - angles)).sum(axis=1))])
-
-
-def _place(
-    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int, transform: FloatArray
-) -> None:
-    """Place a robot's track, and the landmarks that nobody has placed before."""
-    start.transform[robot] = transform
-    new = np.isnan(start.landmark[:, 0]) & np.isfinite(maps[robot][:, 0]) & ~problem.is_known
-    start.landmark[new] = se2.compose(transform, maps[robot][new])
-
-
-def _alignment(
-    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int
-) -> tuple[FloatArray, float]:
-    """The transform of a robot's track on which most landmarks and robots agree, and how many do so."""
-    own = maps[robot]
-    both = np.flatnonzero(np.isfinite(own[:, 0]) & np.isfinite(start.landmark[:, 0]))
-    candidates = [
-        se2.rigid_fit(own[[i, j], :2], start.landmark[[i, j], :2])
-        for i in both.tolist()
-        for j in both.tolist()
-        if i < j
-    ]
-    by_robots = _by_robots(problem, start, robot)
-    candidates += by_robots[:: max(1, len(by_robots) // 50)]
-    best, most = np.zeros(3), 0.0
-    for candidate in candidates:
-        moved = se2.transform_points(candidate, own[both, :2])
-        size = 0.1 * np.linalg.norm(np.ptp(start.landmark[both, :2], axis=0)) if both.size else 0.0
-        off = np.linalg.norm(moved - start.landmark[both, :2], axis=1)
-        votes = float(np.sum(off < max(_AGREES_M, size))) - 1.0
-        if len(by_robots):
-            others = np.array(by_robots)
-            near = np.linalg.norm(others[:, :2] - candidate[:2], axis=1) < 3.0 * _AGREES_M
-            near &= np.abs(se2.wrap_angle(others[:, 2] - candidate[2])) < 0.5
-            votes += 2.0 * float(near.mean())
-        if votes > most:
-            best, most = candidate, votes
-    return best, most
-
-
-def _by_robots(problem: BatchProblem, start: Start, robot: int) -> list[FloatArray]:
-    """Transforms of a robot's track by sightings with heading, between it and placed robots."""
-    sightings = problem.sightings
-    placed = np.isfinite(start.transform[:, 0])
-    seen_by = np.flatnonzero((sightings.target == robot) & placed[sightings.observer] & sightings.has_heading)
-    observers = se2.compose(start.transform[sightings.observer[seen_by]], problem.tracks[0, seen_by])
-    markers = _seen_at(problem, seen_by, observers)
-    bodies = se2.compose(markers, se2.inverse(sightings.marker[seen_by]))
-    found = [*se2.compose(bodies, se2.inverse(problem.tracks[1, seen_by]))]
-    sees = np.flatnonzero(
-        (sightings.observer == robot)
-        & (sightings.target >= 0)
-        & placed[np.maximum(sightings.target, 0)]
-        & sightings.has_heading
-    )
-    if sees.size:
-        targets = se2.compose(start.transform[sightings.target[sees]], problem.tracks[1, sees])
-        markers = se2.compose(targets, sightings.marker[sees])
-        relative = _seen_at(problem, sees, problem.tracks[0, sees])
-        found += [*se2.compose(markers, se2.inverse(relative))]
-    return found
-
+from swarm_loc_estimator.swarm.calibration_states import (
+    ParameterTable,
+    found_at,
+    moved_place,
+    shared_error,
+)
+from swarm_loc_estimator.swarm.swarm import (
+    NO_MAP_ERROR,
+    Anchor,
+    FixedCamera,
+    Landmark,
+    MapError,
+    Surveyed,
+    Swarm,
+)
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
 _SCALES = (50.0, 20.0, 10.0, 5.0)
@@ -216,7 +67,7 @@ class Solution:
     landmark: FloatArray
     parameter: FloatArray  # (N, p) changes of parameters of the description
     parameter_sigma: FloatArray  # (N, p) their standard deviations
-    landmark_covariance: FloatArray  # (S, 3, 3) of x, y, yaw
+    landmark_covariance: FloatArray  # (S, 3, 3) of `place`
     weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
     used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
     variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
@@ -226,6 +77,11 @@ class Solution:
     parameter_column: IntArray  # (N, p) unknown of each parameter
     # Whitened residuals (u, 3) of used sightings, their Jacobians (u, 3, c) and unknowns (u, c), -1: none
     sightings: tuple[FloatArray, FloatArray, IntArray]
+
+    @cached_property
+    def place(self) -> FloatArray:
+        """Places (S, 3) in `map` of what was surveyed, as by `moved_place`."""
+        return _places(self.problem, self.landmark)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> FloatArray:
         """Poses (k, 3) in `map` of robots (k,) at instants (k,); NaN: not known."""
@@ -270,6 +126,54 @@ class Solution:
         to_body = se2.adjoint(se2.inverse(poses))
         columns = np.column_stack([_three(self.column[first]), _three(self.column[last])])
         return self.factor.variances(np.concatenate([-to_body, to_body], axis=2), columns)
+
+
+def _places(problem: BatchProblem, landmark: FloatArray) -> FloatArray:
+    """Places (S, 3) by poses of landmarks and corrections of anchors and cameras (S, 3)."""
+    rows = zip(problem.swarm.surveyed, landmark, strict=True)
+    found = [one if isinstance(body, Landmark) else moved_place(body, one) for body, one in rows]
+    return np.array(found).reshape(-1, 3)
+
+
+class SharedError(NamedTuple):
+    """Error that all places share that were estimated, S of them."""
+
+    error: MapError
+    place: FloatArray  # (S, 3, 4) errors of x, y, yaw by one standard deviation, first of the scale
+    parameter: FloatArray  # (N, p) those of parameters by the scale
+
+
+def shared_by_places(solution: Solution) -> SharedError:
+    """The error that all places share that were estimated, and what is correlated with their scale."""
+    column, parameters = solution.landmark_column, solution.parameter_column
+    is_anchor = np.array([isinstance(one, Anchor) for one in solution.problem.swarm.surveyed], dtype=bool)
+    free, anchors = np.flatnonzero((column >= 0) & ~is_anchor), np.flatnonzero((column >= 0) & is_anchor)
+    place, by = solution.place[free, :2], np.zeros((column.size, 3, 4))
+    if not free.size or not np.ptp(place, axis=0).any():
+        return SharedError(NO_MAP_ERROR, by, np.zeros(parameters.shape))
+    unknowns = [_three(column[free]).ravel(), _three(column[anchors]).ravel(), parameters.ravel()]
+    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(np.concatenate(unknowns))
+    error, by[free], others = shared_error(place, covariance)
+    by[anchors] = others[: 3 * anchors.size].reshape(-1, 3, 4)
+    return SharedError(error, by, others[3 * anchors.size :, 0].reshape(parameters.shape))
+
+
+def placed(solution: Solution, shared: SharedError) -> Swarm:
+    """The description of a problem with all bodies that were estimated where they were found.
+
+    Standard deviations are those of their own errors; landmarks that nothing connects are left out.
+    """
+    swarm, found = solution.problem.swarm, list[Surveyed]()
+    covariance = max(1.0, solution.variance_ratio) * solution.landmark_covariance
+    for index, body in enumerate(swarm.surveyed):
+        if solution.landmark_column[index] >= 0:
+            found.append(found_at(body, solution.place[index], covariance[index], shared.place[index]))
+        elif np.isfinite(solution.place[index]).all():
+            found.append(body)
+    marks, anchors, cameras = (
+        tuple(one for one in found if isinstance(one, kind)) for kind in (Landmark, Anchor, FixedCamera)
+    )
+    return replace(swarm, landmarks=marks, anchors=anchors, cameras=cameras, map_error=shared.error)
 
 
 class ParameterPrior(NamedTuple):
@@ -493,6 +397,7 @@ class Solver:
     def _anchors(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
         """Columns, poses, described poses and standard deviations of what is described."""
         problem, found = self._problem, []
+        places = _places(problem, self._landmark)
         for index, mark in enumerate(problem.swarm.surveyed):
             column, pose = int(self._landmark_column[index]), self._landmark[index]
             if column < 0:
@@ -502,7 +407,7 @@ class Solver:
                 found.append((column, pose, np.zeros(3), np.maximum(sigma, _ORIGIN_SIGMA)))
                 continue
             described = np.array([mark.x, mark.y, mark.yaw or 0.0])
-            pose = se2.compose(pose, described) if isinstance(mark, FixedCamera) else pose
+            pose = places[index]
             if problem.is_known[index]:
                 sigma = np.array([mark.position_sigma, mark.position_sigma, mark.yaw_sigma])
                 if mark.yaw is None:
@@ -594,9 +499,11 @@ class Solver:
         degrees = sightings[1].any(axis=2).sum(axis=1)
         ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
         covariance = np.zeros((self._landmarks, 3, 3))
+        places = _places(self._problem, self._landmark)
         for index in np.flatnonzero(self._landmark_column >= 0).tolist():
             error = factor.covariance(self._landmark_column[index] + np.arange(3))
-            covariance[index] = se2.pose_covariance(self._landmark[index], error)
+            is_shift = self._is_shift[index]
+            covariance[index] = error if is_shift else se2.pose_covariance(places[index], error)
         sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight

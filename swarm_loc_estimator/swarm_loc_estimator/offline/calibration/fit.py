@@ -24,7 +24,8 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.batch.problem import calibrated_parameters, corrections, problem_of
-from swarm_loc_estimator.offline.batch.solver import Solver, started_at
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import started_at
 from swarm_loc_estimator.offline.calibration.models import (
     RUN_TICK_S,
     FittedModels,
@@ -63,6 +64,7 @@ _FORGETTING = 0.005
 """Weight of the prior that parameters stay near their initial values, per squared factor of e."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.07  # Trust radii of the search, in logarithms of the noise
 _BETTER = 0.97  # Scatter of held-out sightings that is asked of a fit without ground truth, per described one
+_MISSED = 0.02  # Share of the poses that a description without ground truth may cost
 _UNCHECKED = "The recording is too short to check the fit: half of it is too little to fit anything."
 _WORST = 1e3  # Cost where nothing was estimated
 _BAD = 0.3  # Costs are capped this far above the initial one: when robots get lost, a score means nothing
@@ -228,6 +230,12 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     ]
     check, is_checked = _warning_alone if options.alone else _warning, all(one.is_held_out for one in folds)
     warning = "" if options.plain else check(folds, swarm, noise) if is_checked else _UNCHECKED
+    shares = [one.given for one in scores]
+    if options.alone and not warning and shares[1] < shares[0] - _MISSED:
+        warning = (
+            f"The description is kept, since {shares[0]:.0%} of the poses are estimated with it, and"
+            f" {shares[1]:.0%} with the new one."
+        )
     kept = swarm if options.alone and warning else calibrated
     return Calibration(kept, whole, noise, scores[0], scores[1], warning)
 
@@ -267,7 +275,7 @@ def _warning_alone(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float])
 
 def _scatter(fold: Fold, swarm: Swarm) -> FloatArray:
     """Scatter of sightings (two components) and of ranges about a batch of a part, by kind of sightings."""
-    problem = problem_of(fold.recording, swarm, ranged=True)
+    problem = problem_of(fold.recording, swarm, fixed=True)
     solution = Solver(problem, started_at(problem, fold.recording.truth)).solve(unwatched)
     error = errors_of(problem, solution.paths())
     known, seen, polar = np.isfinite(error[:, 0]), problem.is_seen, problem.is_polar

@@ -19,7 +19,14 @@ from swarm_loc_estimator.offline.batch.problem import (
     problem_of,
     values_of,
 )
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, started_at
+from swarm_loc_estimator.offline.batch.solver import (
+    ParameterPrior,
+    Solution,
+    Solver,
+    placed,
+    shared_by_places,
+)
+from swarm_loc_estimator.offline.batch.start import started_at
 from swarm_loc_estimator.offline.calibration.motion import (
     WINDOW_S,
     Drive,
@@ -48,7 +55,7 @@ from swarm_loc_estimator.offline.calibration.sightings import (
 )
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 EVALUATIONS = 80  # Runs of the estimator to fit the noise
 
@@ -150,22 +157,22 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     Raises:
         CalibrationError: Too little is known about the poses of robots.
     """
-    begin, truth = problem_of(recording, swarm, ranged=True), recording.truth
+    begin, truth = problem_of(recording, swarm, fixed=True), recording.truth
     if options.plain:
         return _fitted(recording, begin, begin, truth, options)
     if not truth and begin.sightings.size < MIN_SIGHTINGS:
         raise CalibrationError(
-            f"recording '{recording.name}' holds {begin.sightings.size} sightings and ranges by robots that"
-            f" drive; without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or anchors, or"
-            " of other robots."
+            f"recording '{recording.name}' holds {begin.sightings.size} sightings and ranges of robots that"
+            f" drive; without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or anchors, of"
+            " other robots, or by described cameras."
         )
     current = started_at_truth(swarm, recording) if truth else swarm
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
-    seen, polar = begin.is_seen, begin.is_polar
+    seen, polar = begin.is_seen, begin.is_polar & begin.is_by_robot
     parameters = calibrated_parameters(
         polar=bool(polar.any()),
-        poses=bool((seen & ~polar).any()),
+        poses=bool((seen & ~polar & begin.is_by_robot).any()),
         ranges=not seen.all(),
         truth=bool(truth),
     )
@@ -180,7 +187,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # the batch, with parameters about those of the type
         about = np.where(is_fixed, np.nan_to_num(mean - values_of(current, parameters)), 0.0)
         prior = ParameterPrior(about, np.where(is_fixed, sigma, wide)) if number else None
-        problem = problem_of(recording, current, parameters, truth, ranged=True)
+        problem = problem_of(recording, current, parameters, truth, fixed=True)
         solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
         found = all_changed(current, parameters, np.round(solution.parameter, 5))
         typical, apart = _of_types(swarm, found, solution)
@@ -189,36 +196,23 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # motion and noise by its paths
         known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
         paths = {name: one for name, one in known.items() if not truth or name in truth}
-        known_by = problem_of(recording, found, ranged=True)
+        known_by = problem_of(recording, found, fixed=True)
         models = _fitted(recording, begin, known_by, paths, options, solution)
         current = with_noise(models.swarm, {**fixed_noise(swarm), **models.noise})
     starts = [
         replace(one, start=old.start) for one, old in zip(models.swarm.robots, swarm.robots, strict=True)
     ]
+    there = placed(solution, shared_by_places(solution))
+    ids = {mark.id for mark in swarm.landmarks}
     found = replace(
-        models.swarm, robots=tuple(starts), landmarks=swarm.landmarks, anchors=_anchors(swarm, solution)
+        models.swarm,
+        robots=tuple(starts),
+        landmarks=tuple(mark for mark in there.landmarks if mark.id in ids),
+        anchors=there.anchors,
+        cameras=there.cameras,
+        map_error=there.map_error,
     )
     return replace(models, swarm=found)
-
-
-def _anchors(swarm: Swarm, solution: Solution) -> tuple[Anchor, ...]:
-    """The anchors where the batch has them, with its biases."""
-    first, found = len(solution.landmark) - len(swarm.anchors), []
-    for number, one in enumerate(swarm.anchors, first):
-        if solution.landmark_column[number] < 0:
-            found.append(one)
-            continue
-        (x, y, bias), error = solution.landmark[number].tolist(), solution.landmark_covariance[number]
-        sigma = np.sqrt(max(1.0, solution.variance_ratio) * np.diag(error)).tolist()
-        numbers = {"range_bias": one.range_bias + bias, "range_bias_sigma": sigma[2]}
-        if one.position_sigma > 0.0:
-            numbers |= {
-                "x": one.x + x,
-                "y": one.y + y,
-                "position_sigma": math.hypot(*sigma[:2]) / math.sqrt(2.0),
-            }
-        found.append(replace(one, **numbers))
-    return tuple(found)
 
 
 def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[FloatArray, FloatArray]:
@@ -269,8 +263,8 @@ def _fitted(
                 robots[index] = _with_own_noise(robots[index], index, found, solution)
     if not motion and not any(fit.is_enough for fit in cameras):
         raise CalibrationError(
-            f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
-            " at least a minute of a moving robot that sees markers is needed."
+            f"recording '{recording.name}' holds too little odometry or sightings of robots whose paths are"
+            " known; at least a minute of a moving robot that sees markers or is seen is needed."
         )
     swarm = replace(found.swarm, robots=tuple(robots))
     models = FittedModels(swarm, tuple(cameras), tuple(motion), tuple(remarks), {}, paths)
@@ -282,7 +276,7 @@ def _with_leverage(noise: dict[str, float], solution: Solution) -> dict[str, flo
     """Noise of sightings, whose errors by a path that follows them are too small by its own variance."""
     used, residual = np.flatnonzero(solution.used), solution.sightings[0]
     is_good = solution.weight[used] > _GOOD
-    is_good &= solution.problem.is_seen[used]
+    is_good &= (solution.problem.is_seen & solution.problem.is_by_robot)[used]
     is_polar, rng = solution.problem.is_polar[used], np.random.default_rng(0)
     larger = dict(noise)
     for polar, names in _SIGHTED.items():

@@ -114,10 +114,12 @@ def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatAr
     """Measured minus true (m, 3) of all measurements; NaN where a pose is not known."""
     sightings = problem.sightings
     marks = [(mark.x, mark.y, mark.yaw or 0.0) for mark in problem.swarm.landmarks]
-    marks += [(0.0, 0.0, 0.0)] * len(problem.swarm.anchors)  # neither shifted nor biased
+    # neither shifted nor biased
+    marks += [(0.0, 0.0, 0.0)] * (len(problem.swarm.surveyed) - len(marks))
     places = np.where(problem.is_known[:, None], np.array(marks).reshape(-1, 3), np.nan)
     sides = np.full((2, sightings.size, 3), np.nan)
-    sides[1, sightings.landmark >= 0] = places[sightings.landmark[sightings.landmark >= 0]]
+    for side, body in enumerate((sightings.mount, sightings.landmark)):
+        sides[side, body >= 0] = places[body[body >= 0]]
     for index, robot in enumerate(problem.swarm.robots):
         if robot.name in paths:
             for side, who in enumerate((sightings.observer, sightings.target)):

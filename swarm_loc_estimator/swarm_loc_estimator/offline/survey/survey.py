@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -32,18 +31,22 @@ from swarm_loc_estimator.offline.batch.problem import (
     corrections,
     problem_of,
 )
-from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver, Start, start_of
+from swarm_loc_estimator.offline.batch.solver import (
+    ParameterPrior,
+    SharedError,
+    Solution,
+    Solver,
+    placed,
+    shared_by_places,
+)
+from swarm_loc_estimator.offline.batch.start import Start, start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import IN_MAP, INK, SOFT, colour_of, draw_ellipse, save, style
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
-from swarm_loc_estimator.swarm.calibration_states import shared_error
 from swarm_loc_estimator.swarm.swarm import (
-    NO_MAP_ERROR,
     Anchor,
     FixedCamera,
-    Landmark,
-    MapError,
     Swarm,
     UwbDevice,
 )
@@ -397,13 +400,16 @@ def survey(
             f"'{recording.name}' has no marker that belongs to nobody and was seen {MIN_SIGHTINGS} times."
         )
     problem, solution = _solved(recording, swarm, problem, progress)
-    shared = _shared(solution)
-    marks = tuple(_landmarks(problem, solution, shared.place))
-    found = replace(_calibrated(swarm, solution, shared), landmarks=marks, map_error=shared.error)
-    placed = place_fixed(recording, found, solution.at, cameras=cameras)
-    found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
+    shared = shared_by_places(solution)
+    found = replace(
+        _calibrated(swarm, solution, shared),
+        landmarks=placed(solution, shared).landmarks,
+        map_error=shared.error,
+    )
+    fixed = place_fixed(recording, found, solution.at, cameras=cameras)
+    found = replace(found, cameras=fixed.cameras, anchors=fixed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
-    return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
+    return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, fixed))
 
 
 def _solved(
@@ -427,46 +433,7 @@ def _solved(
     return problem, replace(solution, parameter=solution.parameter + change)
 
 
-class _Shared(NamedTuple):
-    """Error that all landmarks share."""
-
-    error: MapError
-    place: FloatArray  # (L, 3, 4) errors of landmarks by one standard deviation, first of the scale
-    parameter: FloatArray  # (N, p) those of parameters by the scale
-
-
-def _shared(solution: Solution) -> _Shared:
-    """The error that all landmarks share that were estimated, and what is correlated with their scale."""
-    column, place = solution.landmark_column, solution.landmark
-    free, parameters = np.flatnonzero(column >= 0), solution.parameter_column
-    places = np.zeros((column.size, 3, 4))
-    if not free.size or not np.ptp(place[free, :2], axis=0).any():
-        return _Shared(NO_MAP_ERROR, places, np.zeros(parameters.shape))
-    unknowns = np.concatenate([(column[free][:, None] + np.arange(3)).ravel(), parameters.ravel()])
-    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
-    error, places[free], others = shared_error(place[free, :2], covariance)
-    return _Shared(error, places, others[:, 0].reshape(parameters.shape))
-
-
-def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
-    """All landmarks that are connected, with standard deviations for those that were estimated."""
-    variance = np.einsum("kii->ki", max(1.0, solution.variance_ratio) * solution.landmark_covariance)
-    variance = np.maximum(variance - np.sum(shared**2, axis=2), _LEAST_SIGMA**2)
-    found = []
-    for mark, pose, own, is_known in zip(
-        problem.swarm.landmarks, solution.landmark.tolist(), variance, problem.is_known, strict=True
-    ):
-        if is_known and not mark.is_estimated:
-            found.append(mark)
-        elif np.isfinite(pose).all():
-            x, y, yaw = pose
-            placed = replace(mark, x=x, y=y, position_sigma=math.sqrt(0.5 * float(own[0] + own[1])))
-            has_yaw = mark.yaw is not None
-            found.append(replace(placed, yaw=yaw, yaw_sigma=math.sqrt(float(own[2]))) if has_yaw else placed)
-    return found
-
-
-def _calibrated(swarm: Swarm, solution: Solution, shared: _Shared) -> Swarm:
+def _calibrated(swarm: Swarm, solution: Solution, shared: SharedError) -> Swarm:
     """The swarm with those parameters corrected that differ significantly; turn biases are not constant.
 
     Those that share the error of the map's scale are left to the filter. It takes them as independent, so
