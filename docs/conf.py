@@ -8,6 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sphinx.pycode import ModuleAnalyzer
+
+import swarm_loc_estimator
 from swarm_loc_estimator.common.parameters import number_specs
 
 if TYPE_CHECKING:
@@ -78,8 +81,9 @@ def _add_mermaid(app: Sphinx, *event: Any) -> None:
 
 
 def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
-    """Show a default without its own arguments, and a function or factory by its name if it has one."""
-    signature, returned = event[-2:]
+    """Show a default without its own arguments, a function or factory by its name, an alias by its own."""
+    alias = r"TypeAliasForwardRef\('(\w+)'\)"  # what Sphinx writes for an alias in a union
+    signature, returned = (text and re.sub(alias, r"\1", text) for text in event[-2:])
     if signature:
         signature = re.sub(r"= (\w+)\([^()]*\)", r"= \1()", signature)
         signature = re.sub(r"<function [^<>]*<lambda>[^>]*>", "...", signature)
@@ -87,15 +91,17 @@ def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
     return signature, returned
 
 
-def _prepare_docstring(
-    _app: Sphinx, what: str, _name: str, obj: Any, _options: Any, lines: list[str]
-) -> None:
-    """Describe the numbers of a dataclass by their specs; let no colon of an attribute name a type.
+def _prepare_docstring(_app: Sphinx, what: str, name: str, obj: Any, _options: Any, lines: list[str]) -> None:
+    """Describe numbers of a dataclass by their specs, constants by their docstrings; no colon names a type.
 
     A field of a named tuple without a comment has no description.
     """
     if lines and lines[0].startswith("Alias for field number"):
         lines.clear()
+    if what == "data":  # autodoc would take the docstring of its type: the API loads it from another module
+        constant = name.rpartition(".")[2]
+        of_module = ModuleAnalyzer.for_module(vars(swarm_loc_estimator)["_MODULE_OF"][constant])
+        lines[:] = of_module.find_attr_docs().get(("", constant), [])
     if what in {"attribute", "data", "property"}:
         lines.insert(0, r"\ ")  # shown as nothing; a colon behind it names no type
     if isinstance(obj, type) and is_dataclass(obj) and "Attributes:" not in lines:

@@ -52,7 +52,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import (
     assign,
     assign_matrix,
@@ -272,7 +272,7 @@ def _gathered(covariance: FloatArray) -> float:
     return float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
 
 
-@cached_njit
+@norefcount_njit
 def record_pair(measurements: Measurements, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
     """Store the memory of a pair (PAIR_ROWS, 3) that `use_mean` has written, once its measurement is used."""
     observer, target = measurements.observer[k], measurements.target[k]
@@ -481,7 +481,7 @@ def _write_cofactors(matrix: FloatArray, out: FloatArray) -> float:
     return determinant
 
 
-@cached_njit
+@norefcount_njit
 def _weight(
     measurements: Measurements, k: int, belief: BeliefArrays, seen: FloatArray, share: float
 ) -> float:

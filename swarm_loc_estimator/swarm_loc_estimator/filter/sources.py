@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.jit import inlined_njit, norefcount_njit
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements
 from swarm_loc_estimator.filter.models import POLAR, has_kernel
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArrays, covariance_within
@@ -276,7 +276,7 @@ def assess(
     return guilty if guilty >= belief.tracked.size else _instead(belief, guilty, max_fault_score, now_ns)
 
 
-@cached_njit
+@norefcount_njit
 def _as_good(belief: BeliefArrays, robot: int, guilty: int, now_ns: int) -> int:
     """The camera that contradicts a guilty one about a robot, as long as others agree with that; -1: none."""
     state, rival, agreeing = belief.sources, -1, 0
@@ -303,7 +303,7 @@ def assess_direction(belief: BeliefArrays, robot: int, misread: bool, share: flo
     score[direction] = min(max(0.0, score[direction] + change), 2.0 * limit)
 
 
-@cached_njit
+@norefcount_njit
 def _instead(belief: BeliefArrays, robot: int, max_fault_score: float, now_ns: int) -> int:
     """Suspend the fixes of a contradicted robot in its place; return the robot if it has none."""
     state, fixes = belief.sources, fixes_of(belief, robot)
@@ -316,7 +316,7 @@ def _instead(belief: BeliefArrays, robot: int, max_fault_score: float, now_ns: i
     return robot
 
 
-@cached_njit
+@norefcount_njit
 def _relieve(belief: BeliefArrays, robot: int, place: int, relief: float, now_ns: int) -> None:
     """Lower evidence and fault scores by what agrees; of a suspect camera if others locate the robot, too."""
     state, others = belief.sources, 0
@@ -332,7 +332,7 @@ def _relieve(belief: BeliefArrays, robot: int, place: int, relief: float, now_ns
         state.score[source] = max(0.0, state.score[source] - relief)
 
 
-@cached_njit
+@norefcount_njit
 def _guilty(belief: BeliefArrays, robot: int, source: int, now_ns: int) -> int:
     """That end of a bad link of which more links are bad; LINK: neither; UNDECIDED."""
     bad_robot, share_robot = _bad_links(belief, robot, now_ns)
@@ -354,7 +354,7 @@ def _sees_robots(belief: BeliefArrays, source: int) -> bool:
     return sees
 
 
-@cached_njit
+@norefcount_njit
 def _bad_links(belief: BeliefArrays, node: int, now_ns: int) -> tuple[int, float]:
     """Number and share of bad links of a source; a robot with no other link agrees with a camera anywhere."""
     state, robots = belief.sources, belief.tracked.size
@@ -559,7 +559,7 @@ def count_gated(
     return lost, why
 
 
-@cached_njit
+@norefcount_njit
 def _is_elsewhere_by_radios(belief: BeliefArrays, robot: int) -> bool:
     """Whether radios deny a pose by too long and too short ranges; a wall or bias changes all in one way."""
     state, newest_ns, long, short = belief.sources, NEVER_NS // 2, 0, 0
