@@ -8,9 +8,7 @@ worth to those who never see a landmark. W2 has hidden systematic errors that to
 experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
 yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
-out, while sightings are still 150-300 ms late. "rendered" is W2 with five robots through everything there is:
-rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal".
-At the end the marker detector sees the same pictures as others.
+out, while sightings are still 150-300 ms late.
 """
 
 import math
@@ -22,22 +20,17 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.epuck import rendered
 from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.scenarios.eight_run import EightSettings, simulate_eight
 from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
-from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
-from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
-VISION_SEEDS, VISION_FRAMES = 3, 10
-RENDERED_SEEDS, RENDERED_S = 3, 60.0
 SETTLING_S = 10.0
 LAPS_S = 108.0
 PAPER_STATE_PERIOD_S = 1.0 / 7.5
@@ -252,27 +245,10 @@ def draw(results: dict[str, list[Outcome]]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    options = options_of(
-        __doc__,
-        arguments,
-        worlds=(WORLDS, "how many of W2, and at most of the others"),
-        rendered=(RENDERED_SEEDS, "how many worlds through the whole graph"),
-    )
-    figures: dict[str, float] = {}
-    try:
-        if options.rendered:
-            swarm = self_calibrating(rendered.swarm_of_world())
-            figures = rendered.measure(range(1, options.rendered + 1), RENDERED_S, SETTLING_S, swarm)
-    except LiveError as error:
-        print(f"\n{error}", file=sys.stderr)
-        return 1
+    options = options_of(__doc__, arguments, worlds=(WORLDS, "how many of W2, and at most of the others"))
     rows = cases(options.worlds)
     outcome((replace(rows[-1], robots=2), 1))  # compiles what is not compiled yet
-    figures |= report(measure(rows))
-    print("markers in pictures ...", flush=True)
-    seen = vision_report.measure(range(VISION_SEEDS), VISION_FRAMES)
-    print(f"{seen.tables()}\nplot: {vision_report.plot(seen.scores)}")
-    figures |= seen.figures()
+    figures = report(measure(rows))
     print(f"figures: {write_figures('epuck', figures)}")
     return 0
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.inputs.lidar_map import exact_map
+from bench.lidar.known_map import exact_map
 from bench.pushbot.exploration import PERIOD_S, PushBotNoise
 from bench.pushbot.lidar import BEAMS, LIDAR, NEAREST, ODOMETRY_STEPS, SWEEP_S, SWEEP_STEPS, LidarBody
 from bench.pushbot.mapping import LIDAR_SLIPS
