@@ -3,8 +3,7 @@
     make bench-epuck
     make bench-epuck ARGS="--worlds 24"
 
-W0 has the printed sigmas as white noise; a dense block of twenty shows what sightings between robots are
-worth to those who never see a landmark. W2 has hidden systematic errors that together look like the paper's
+W0 has the printed sigmas as white noise. W2 has hidden systematic errors that together look like the paper's
 experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
 yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
@@ -20,7 +19,6 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.scenarios.eight_run import EightSettings, simulate_eight
 from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
@@ -30,7 +28,7 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 SLOW, FAST = 0.06, 0.08
-W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
+W0_SEEDS, WORLDS, FAST_WORLDS = 6, 24, 8
 SETTLING_S = 10.0
 LAPS_S = 108.0
 PAPER_STATE_PERIOD_S = 1.0 / 7.5
@@ -53,12 +51,11 @@ class Case:
     """One row of the report."""
 
     name: str  # Of its figures
-    robots: int  # How many drive the eight; 0: the dense block
+    robots: int  # How many drive the eight
     seeds: int  # Of the worlds
     world: ErrorModel  # Hidden imperfections
     speed: float = SLOW  # [m/s]
     filter: str = "white"  # How the swarm is described and what the estimator does, of `FILTERS`
-    relative: bool = True  # Whether sightings between robots are used
 
 
 @dataclass(frozen=True)
@@ -133,32 +130,19 @@ def cases(worlds: int) -> list[Case]:
         for robots in (5, 1)
         for kind in ("paper", "selfcal")
     ]
-    rows += [
-        Case(f"w0.blind20.{kind}", 0, min(worlds, DENSE_SEEDS), W0, relative=kind == "relative")
-        for kind in ("relative", "absolute")
-    ]
     return rows + [Case(f"w0.robots{robots}", robots, min(worlds, W0_SEEDS), W0) for robots in (5, 1)]
 
 
 def simulate(case: Case, seed: int) -> SimulatedRun:
     """Simulate a world of a case."""
-    if case.robots == 0:
-        run = simulate_dense(DenseSettings(seed=seed, errors=case.world))
-    else:
-        run = simulate_eight(
-            EightSettings(
-                seed=seed, duration_s=LAPS_S, robots=case.robots, speed=case.speed, errors=case.world
-            )
-        )
+    run = simulate_eight(EightSettings(seed, LAPS_S, case.robots, case.speed, case.world))
     prepare = FILTERS[case.filter][0]
     run = replace(run, swarm=prepare(run.swarm))
     if case.filter == "paper":  # images belong to the closest stored state
         frames, period_ns = run.frames.copy(), round(PAPER_STATE_PERIOD_S * 1e9)
         frames["stamp_ns"] = (frames["stamp_ns"] + period_ns // 2) // period_ns * period_ns
         run = replace(run, frames=frames)
-    if case.relative:
-        return run
-    return run.masked(np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks]))
+    return run
 
 
 def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
@@ -168,9 +152,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
     stamp_ns = ticks(run)
     result = run_core(run, stamp_ns, FILTERS[case.filter][1])
     settled = stamp_ns >= run.start_ns + SETTLING_S * 1e9
-    robots = np.arange(len(run.swarm.robots)) if case.robots else blind_robots()
-    errors = errors_of(result.poses, run, stamp_ns)[settled][:, robots]
-    covariances = result.covariances[settled][:, robots]
+    errors, covariances = errors_of(result.poses, run, stamp_ns)[settled], result.covariances[settled]
     located = ~np.isnan(errors[..., 0])
     errors, covariances = errors[located], covariances[located]
     return case.name, Outcome(

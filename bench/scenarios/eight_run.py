@@ -37,29 +37,14 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, 
 from swarm_loc_vision.markers.families import family_named
 
 WALL_MARKER_PITCH = 0.4
-
-
 MARKER_HEIGHT = 0.08
-
-
 FACE_DISTANCE = 0.033
-
-
 FACE_NAMES = ("front_left", "left", "back", "right", "front_right")
-
-
 CAMERA = CameraMount(x=0.03, z=0.08)
-
-
 VIEW = View(field_of_view=math.radians(60.0), nearest=0.12, farthest=1.5, incidence=math.radians(65.0))
 
-
 WHEEL_SEPARATION = 0.053
-
-
 STEP_NS = 5_000_000
-
-
 _FIRST_FACE_ID, _FIRST_LANDMARK_ID = 10, 100
 
 
@@ -101,11 +86,7 @@ def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swar
 
 
 def drive_robots(
-    rng: np.random.Generator,
-    settings: EightSettings,
-    start: FloatArray,
-    control: Controller,
-    first_face_id: int = _FIRST_FACE_ID,
+    rng: np.random.Generator, settings: EightSettings, start: FloatArray, control: Controller
 ) -> tuple[Swarm, Trajectories, Records]:
     """Drive robots from `start` (N, 3): the swarm as described, where it went, and its odometry."""
     model = Drive(WHEEL_SEPARATION, settings.errors.wheel_noise, settings.errors.turn_slip)
@@ -113,7 +94,7 @@ def drive_robots(
     truth, odometry = record_drive(
         rng, start, control, model, step_ns=STEP_NS, duration_s=duration_s, odometry_rate_hz=rate_hz
     )
-    return describe(settings, start, first_face_id), truth, odometry
+    return describe(settings, start), truth, odometry
 
 
 def describe(settings: EightSettings, start: FloatArray, first_face_id: int = _FIRST_FACE_ID) -> Swarm:
