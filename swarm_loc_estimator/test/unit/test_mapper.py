@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import cache
 
 import numpy as np
 import pytest
@@ -56,7 +58,14 @@ def assert_near(
 
 
 def mapped(seed: int, hops: int, slip: float = 0.02) -> tuple[CooperativeMapper, RoomRobot]:
-    """A robot alone that has gone to so many goals."""
+    """A robot alone that has gone to so many goals; a test may change what it gets."""
+    found = _mapped(seed, hops, slip)
+    factor = found[0].graph._factor  # which never changes, and SciPy does not copy
+    return deepcopy(found, {id(factor): factor})
+
+
+@cache
+def _mapped(seed: int, hops: int, slip: float) -> tuple[CooperativeMapper, RoomRobot]:
     mapper, robot = CooperativeMapper(), RoomRobot(START, slip, np.random.default_rng(seed))
     explore(mapper, mapper.join(np.array(START), KNOWN), robot, hops)
     return mapper, robot
