@@ -5,14 +5,10 @@ import sys
 
 BENCHMARKS = {
     "aerial": "bench.aerial",
-    "calibrated": "bench.peers.calibrated",
     "commissioning": "bench.commissioning",
     "droplet": "bench.droplet",
-    "droplet_real": "bench.droplet.real",
-    "drivers": "bench.graph.drivers",
     "epuck": "bench.epuck",
     "generate_bag": "bench.scenarios.generate_bag",
-    "inputs": "bench.inputs",
     "integrity": "bench.integrity",
     "large_swarms": "bench.graph.large_swarms",
     "lidar": "bench.lidar",
@@ -24,9 +20,7 @@ BENCHMARKS = {
     "robots": "bench.robots",
     "robustness": "bench.robustness",
     "scaling": "bench.peers.scaling",
-    "sweep": "bench.sweep",
     "vision": "bench.vision",
-    "watch": "bench.watch",
 }
 """Name -> module."""
 

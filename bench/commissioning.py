@@ -11,7 +11,6 @@ ones; their errors are after a rigid fit of all poses, too.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -23,7 +22,15 @@ import numpy as np
 from bench.scenarios.eight_run import VIEW, EightSettings, camera_exposures, drive_eight
 from bench.scenarios.lived_run import SimulatedRun
 from bench.scenarios.sightings import observe_markers
-from bench.shared.common import Cell, ProgressLine, new_plot, save_plot, table, write_figures
+from bench.shared.common import (
+    Cell,
+    ProgressLine,
+    new_plot,
+    options_of,
+    save_plot,
+    table,
+    write_figures,
+)
 from bench.shared.simulated_run import detection_rows, fitted_errors, odometry_rows, position_rmse, ticks
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel, hidden_geometry
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -64,12 +71,8 @@ class Outcome:
 
 def main() -> None:
     """Print the table, write the figures, draw the errors."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=5, help="worlds of each case")
-    parser.add_argument("--cases", nargs="+", choices=[*CASES], default=[*CASES])
-    arguments = parser.parse_args()
+    names = tuple(CASES)
+    arguments = options_of(__doc__, seeds=(5, "worlds of each case"), cases=(names, "what to survey", names))
     seeds = [BAG_SEED, *(seed for seed in range(1, arguments.seeds + 2) if seed != BAG_SEED)]
     found: dict[str, list[Outcome]] = {}
     for name in arguments.cases:

@@ -7,7 +7,6 @@ that of their odometry alone; "bias" is the estimated sum of both biases of a pa
 
 from __future__ import annotations
 
-import argparse
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.shared.common import rms, table, write_figures
+from bench.shared.common import options_of, rms, table, write_figures
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import (
@@ -193,9 +192,8 @@ _PARTS: Mapping[str, Callable[[], dict[str, float]]] = {
 
 def main() -> None:
     """Measure, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="+", choices=[*_PARTS], default=[*_PARTS], help="what to measure")
-    names = parser.parse_args().parts
+    parts = tuple(_PARTS)
+    names = options_of(__doc__, parts=(parts, "what to measure", parts)).parts
     figures = {f"{name}.{key}": value for name in names for key, value in _PARTS[name]().items()}
     print(table(["figure", "value"], [[key, value] for key, value in figures.items()]))
     print(f"Written: {write_figures('robots', figures)}")

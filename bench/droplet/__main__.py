@@ -1,12 +1,11 @@
 """Range, bearing and heading of Droplets from brightness matrices, beside what theory allows.
 
     make bench-droplet
-    make bench-droplet ARGS="--poses 500 --live 0 --replays 1"
+    make bench-droplet ARGS="--poses 500"
 
 Bearings and headings are uniform, readings have one count of noise and saturate at 255. Beside errors stands
 the Cramer-Rao bound, which no unbiased estimate betters. "mismatch" are robots whose elements differ by 10 %,
-before and after their gains were calibrated from 200 exchanges of the two, poses unknown and known. At the
-end a swarm of 20 is localized through infrared, see bench/droplet/swarm.py.
+before and after their gains were calibrated from 200 exchanges of the two, poses unknown and known.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.droplet import swarm as droplet_swarm
 from bench.droplet.cramer_rao import information
 from bench.shared.common import Cell, options_of, plot_curves, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -31,7 +29,7 @@ from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, load_ir_platform
 
 CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
-POSES, LIVE, REPLAYS = 12000, 2, 6
+POSES = 12000
 MISMATCH, CALIBRATION, COUPLES = 0.1, 200, 12
 """How much elements of each of so many couples of robots differ, and their exchanges to calibrate with."""
 _TIMED, _REPEATS = 200, 20
@@ -217,18 +215,10 @@ def best_time(estimator: MaximumLikelihood, calls: Sequence[FloatArray]) -> floa
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    options = options_of(
-        __doc__,
-        arguments,
-        poses=(POSES, "per range; of mismatch a twelfth per couple"),
-        live=(LIVE, "runs of the swarm over the whole graph"),
-        replays=(REPLAYS, "bags of the swarm"),
-    )
+    options = options_of(__doc__, arguments, poses=(POSES, "per range; of mismatch a twelfth per couple"))
     figures = accuracy(options.poses)
     figures |= mismatch(options.poses // COUPLES)
     figures |= times()
-    if options.live or options.replays:
-        figures |= droplet_swarm.measure(range(1, options.live + 1), range(1, options.replays + 1))
     print(f"figures: {write_figures('droplet', figures)}")
     return 0
 

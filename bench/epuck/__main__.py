@@ -3,14 +3,11 @@
     make bench-epuck
     make bench-epuck ARGS="--worlds 24"
 
-W0 has the printed sigmas as white noise; a dense block of twenty shows what sightings between robots are
-worth to those who never see a landmark. W2 has hidden systematic errors that together look like the paper's
+W0 has the printed sigmas as white noise. W2 has hidden systematic errors that together look like the paper's
 experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
 yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
-out, while sightings are still 150-300 ms late. "rendered" is W2 with five robots through everything there is:
-rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal".
-At the end the marker detector sees the same pictures as others.
+out, while sightings are still 150-300 ms late.
 """
 
 import math
@@ -22,22 +19,16 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.epuck import rendered
-from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.scenarios.eight_run import EightSettings, simulate_eight
 from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
-from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
-from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 SLOW, FAST = 0.06, 0.08
-W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
-VISION_SEEDS, VISION_FRAMES = 3, 10
-RENDERED_SEEDS, RENDERED_S = 3, 60.0
+W0_SEEDS, WORLDS, FAST_WORLDS = 6, 24, 8
 SETTLING_S = 10.0
 LAPS_S = 108.0
 PAPER_STATE_PERIOD_S = 1.0 / 7.5
@@ -60,12 +51,11 @@ class Case:
     """One row of the report."""
 
     name: str  # Of its figures
-    robots: int  # How many drive the eight; 0: the dense block
+    robots: int  # How many drive the eight
     seeds: int  # Of the worlds
     world: ErrorModel  # Hidden imperfections
     speed: float = SLOW  # [m/s]
     filter: str = "white"  # How the swarm is described and what the estimator does, of `FILTERS`
-    relative: bool = True  # Whether sightings between robots are used
 
 
 @dataclass(frozen=True)
@@ -140,32 +130,19 @@ def cases(worlds: int) -> list[Case]:
         for robots in (5, 1)
         for kind in ("paper", "selfcal")
     ]
-    rows += [
-        Case(f"w0.blind20.{kind}", 0, min(worlds, DENSE_SEEDS), W0, relative=kind == "relative")
-        for kind in ("relative", "absolute")
-    ]
     return rows + [Case(f"w0.robots{robots}", robots, min(worlds, W0_SEEDS), W0) for robots in (5, 1)]
 
 
 def simulate(case: Case, seed: int) -> SimulatedRun:
     """Simulate a world of a case."""
-    if case.robots == 0:
-        run = simulate_dense(DenseSettings(seed=seed, errors=case.world))
-    else:
-        run = simulate_eight(
-            EightSettings(
-                seed=seed, duration_s=LAPS_S, robots=case.robots, speed=case.speed, errors=case.world
-            )
-        )
+    run = simulate_eight(EightSettings(seed, LAPS_S, case.robots, case.speed, case.world))
     prepare = FILTERS[case.filter][0]
     run = replace(run, swarm=prepare(run.swarm))
     if case.filter == "paper":  # images belong to the closest stored state
         frames, period_ns = run.frames.copy(), round(PAPER_STATE_PERIOD_S * 1e9)
         frames["stamp_ns"] = (frames["stamp_ns"] + period_ns // 2) // period_ns * period_ns
         run = replace(run, frames=frames)
-    if case.relative:
-        return run
-    return run.masked(np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks]))
+    return run
 
 
 def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
@@ -175,9 +152,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
     stamp_ns = ticks(run)
     result = run_core(run, stamp_ns, FILTERS[case.filter][1])
     settled = stamp_ns >= run.start_ns + SETTLING_S * 1e9
-    robots = np.arange(len(run.swarm.robots)) if case.robots else blind_robots()
-    errors = errors_of(result.poses, run, stamp_ns)[settled][:, robots]
-    covariances = result.covariances[settled][:, robots]
+    errors, covariances = errors_of(result.poses, run, stamp_ns)[settled], result.covariances[settled]
     located = ~np.isnan(errors[..., 0])
     errors, covariances = errors[located], covariances[located]
     return case.name, Outcome(
@@ -252,27 +227,10 @@ def draw(results: dict[str, list[Outcome]]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    options = options_of(
-        __doc__,
-        arguments,
-        worlds=(WORLDS, "how many of W2, and at most of the others"),
-        rendered=(RENDERED_SEEDS, "how many worlds through the whole graph"),
-    )
-    figures: dict[str, float] = {}
-    try:
-        if options.rendered:
-            swarm = self_calibrating(rendered.swarm_of_world())
-            figures = rendered.measure(range(1, options.rendered + 1), RENDERED_S, SETTLING_S, swarm)
-    except LiveError as error:
-        print(f"\n{error}", file=sys.stderr)
-        return 1
+    options = options_of(__doc__, arguments, worlds=(WORLDS, "how many of W2, and at most of the others"))
     rows = cases(options.worlds)
     outcome((replace(rows[-1], robots=2), 1))  # compiles what is not compiled yet
-    figures |= report(measure(rows))
-    print("markers in pictures ...", flush=True)
-    seen = vision_report.measure(range(VISION_SEEDS), VISION_FRAMES)
-    print(f"{seen.tables()}\nplot: {vision_report.plot(seen.scores)}")
-    figures |= seen.figures()
+    figures = report(measure(rows))
     print(f"figures: {write_figures('epuck', figures)}")
     return 0
 

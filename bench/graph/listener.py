@@ -14,15 +14,12 @@ from bench.scenarios.eight_run import EightSettings, describe
 from bench.shared.bags import read_truth
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_drivers.sim.worlds import ErrorModel
-from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.live_run import START_PATIENCE_S, LiveError, LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
-TYPE_OF = {"odom": ODOMETRY, "detections": DETECTIONS, "ground_truth": POSE_STAMPED}
-"""Recorded topics of each robot with their message types."""
 _CLASS_OF: dict[str, type] = {
     "odom": Odometry,
     "detections": MarkerDetectionArray,

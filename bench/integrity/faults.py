@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.scenarios.eight_run import VIEW, EightSettings, camera_exposures, drive_eight
+from bench.scenarios.eight_run import EightSettings
 from bench.scenarios.lived_run import (
     FRAME_DTYPE,
     ODOMETRY_DTYPE,
@@ -16,7 +16,6 @@ from bench.scenarios.lived_run import (
     Records,
     SimulatedRun,
 )
-from bench.scenarios.sightings import observe_markers
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
 from swarm_loc_estimator.common import se2
@@ -56,32 +55,10 @@ def settings_of(seed: int, errors: ErrorModel, duration_s: float = DURATION_S) -
     return EightSettings(seed=seed, duration_s=duration_s, errors=errors)
 
 
-SwarmChange = Callable[[Swarm], Swarm]
-TruthChange = Callable[[Trajectories], Trajectories]
 SightingSource = Callable[[IntArray, Trajectories], FloatArray]
 """Values (k, 3) of false sightings at stamps (k,)."""
 
 _LATENESS_NS = 50_000_000
-
-
-def simulate(
-    settings: EightSettings, as_it_is: SwarmChange | None = None, moved: TruthChange | None = None
-) -> SimulatedRun:
-    """Simulate the eight in a world that differs from its description.
-
-    Args:
-        settings: Of the run.
-        as_it_is: From the described swarm to the one that cameras see.
-        moved: Changes true poses without any odometry.
-    """
-    rng = np.random.default_rng(settings.seed)
-    swarm, truth, odometry = drive_eight(rng, settings)
-    if moved:
-        truth = moved(truth)
-    exposures = camera_exposures(rng, settings.robots, truth)
-    seen = as_it_is(swarm) if as_it_is else swarm
-    frames, sightings = observe_markers(rng, seen, truth, exposures, VIEW, settings.errors)
-    return SimulatedRun(swarm, truth, odometry, frames, sightings)
 
 
 def seconds(run: LivedRun, stamp_ns: IntArray) -> FloatArray:
@@ -241,7 +218,7 @@ def turned_camera(swarm: Swarm, robot: int, yaw: float) -> Swarm:
     return Swarm(tuple(robots), swarm.landmarks)
 
 
-def kidnapped(robot: int, at_s: float) -> TruthChange:
+def kidnapped(robot: int, at_s: float) -> Callable[[Trajectories], Trajectories]:
     """Move a robot to the opposite side of the eight, where it keeps driving."""
 
     def change(truth: Trajectories) -> Trajectories:

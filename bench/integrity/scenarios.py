@@ -12,6 +12,7 @@ import numpy as np
 from bench.integrity import faults
 from bench.integrity.faults import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
 from bench.integrity.sensors import SENSOR_SCENARIOS
+from bench.scenarios.eight_run import simulate_eight
 from bench.scenarios.lived_run import SimulatedRun
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import W0, W2
@@ -22,20 +23,20 @@ _FACE = 20  # A marker of the second robot
 
 
 def _clean_w0(seed: int) -> Fault:
-    return Fault(faults.simulate(settings_of(seed, W0)))
+    return Fault(simulate_eight(settings_of(seed, W0)))
 
 
 @lru_cache(maxsize=1)  # scenarios of one seed share it
 def _clean(seed: int) -> SimulatedRun:
-    return faults.simulate(settings_of(seed, CLEAN))
+    return simulate_eight(settings_of(seed, CLEAN))
 
 
 def _w2_on_w0_file(seed: int) -> Fault:
-    return Fault(faults.simulate(settings_of(seed, SYSTEMATIC)))
+    return Fault(simulate_eight(settings_of(seed, SYSTEMATIC)))
 
 
 def _hidden_in_noise(seed: int) -> Fault:
-    return Fault(faults.simulate(settings_of(seed, W2)))
+    return Fault(simulate_eight(settings_of(seed, W2)))
 
 
 def _driver_gap(seed: int) -> Fault:
@@ -50,7 +51,7 @@ def _wrong_starts(seed: int) -> Fault:
 
 def _kidnapped(seed: int) -> Fault:
     at_s = 20.0 + 3.1 * seed % 15.0
-    run = faults.simulate(settings_of(seed, CLEAN), moved=faults.kidnapped(0, at_s))
+    run = simulate_eight(settings_of(seed, CLEAN), moved=faults.kidnapped(0, at_s))
     seen_s = faults.next_sighting_s(run, 0, at_s)
     return Fault(run, seen_s, (at_s, seen_s))
 
@@ -66,7 +67,7 @@ def _false_sightings(seed: int) -> Fault:
 def _moved_landmark(seed: int) -> Fault:
     angle = np.random.default_rng([seed, 3]).uniform(0.0, 2.0 * math.pi)
     which, step = faults.busiest_landmark(_clean(seed)), (0.2 * math.cos(angle), 0.2 * math.sin(angle))
-    moved = faults.simulate(settings_of(seed, CLEAN), lambda swarm: faults.moved_landmark(swarm, which, step))
+    moved = simulate_eight(settings_of(seed, CLEAN), lambda swarm: faults.moved_landmark(swarm, which, step))
     return Fault(moved, about=f"landmark {which}")
 
 
@@ -75,7 +76,7 @@ def _wrong_scale(seed: int) -> Fault:
 
 
 def _turned_camera(seed: int) -> Fault:
-    turned = faults.simulate(
+    turned = simulate_eight(
         settings_of(seed, CLEAN), lambda swarm: faults.turned_camera(swarm, 0, math.radians(10.0))
     )
     return Fault(faults.changed_cameras(_clean(seed), turned, 0, FAULT_S[0]))

@@ -13,20 +13,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.inputs.imu import IMU, RATE_HZ, simulate_gyroscopes, with_imus
-from bench.inputs.lidar_map import exact_map, record
-from bench.inputs.mocap import FIX_NS, HEADING_SIGMA, POSITION_SIGMA
-from bench.inputs.overhead import TOP
-from bench.inputs.uwb import Plan, simulate
 from bench.integrity import faults
 from bench.integrity.faults import CLEAN, FAULT_S, Fault, settings_of
+from bench.lidar.known_map import exact_map, record
 from bench.pushbot.mapping import PLANS
-from bench.scenarios.eight_run import drive_eight
-from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns, survivors
+from bench.scenarios.eight_run import drive_eight, simulate_eight
+from bench.scenarios.lived_run import (
+    CAMERA_LATENESS,
+    ODOMETRY_DTYPE,
+    LivedRun,
+    SimulatedRun,
+    arrival_ns,
+    survivors,
+)
 from bench.scenarios.sightings import schedule_exposures
 from bench.shared.common import OUT
 from bench.shared.simulated_run import detection_rows
+from swarm_loc_drivers.sim.differential_drive import Drive, roll
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
@@ -34,9 +39,13 @@ from swarm_loc_estimator.filter.measurements import concatenate, select
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.sensors.camera import CameraSensor, DetectionRows
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
+from swarm_loc_estimator.sensors.imu import TurnRateRows
+from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
-from swarm_loc_estimator.swarm.swarm import FixedCamera, Swarm
+from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Robot, StartSigma, Swarm, UwbDevice
 
+_TOP = Face("top", 0, 0.0, 0.0, 0.105, 0.0, size=0.05, lies=True)  # The tag on a robot
 _CAMERAS = tuple(
     FixedCamera(f"ceiling{k + 1}", x, 0.0, 2.0, yaw=0.5 * math.pi, position_sigma=0.002, yaw_sigma=0.001)
     for k, x in enumerate((-0.45, 0.45))
@@ -55,7 +64,7 @@ def drive_under_ceiling(seed: int, duration_s: float) -> LivedRun:
     settings = replace(settings_of(seed, CLEAN, duration_s), start_known=False)
     described, truth, odometry = drive_eight(np.random.default_rng(seed), settings)
     robots = tuple(
-        replace(robot, camera=None, faces=(replace(TOP, id=k + 1),))
+        replace(robot, camera=None, faces=(replace(_TOP, id=k + 1),))
         for k, robot in enumerate(described.robots)
     )
     return LivedRun(Swarm(robots, (), _CAMERAS), truth, odometry)
@@ -110,7 +119,7 @@ def observe_tags(run: LivedRun, seen: Swarm, seed: int) -> DetectionRows:
 
 _DURATION_S = 80.0  # Of each run; more than 30 s after the fault
 _TO_THE_END_S = (FAULT_S[0], _DURATION_S)
-_MOCAP_SIGMA = (POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA)
+_MOCAP_SIGMA, _MOCAP_NS = (0.001, 0.001, math.radians(0.3)), 1_000_000_000 // 30
 Span = tuple[float, float]
 
 
@@ -217,11 +226,11 @@ def _face_turned_90(seed: int) -> Fault:
 @lru_cache(maxsize=2)  # scenarios of one seed share it
 def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:
     """The eight, for longer than other scenarios."""
-    return faults.simulate(settings_of(seed, errors, _DURATION_S))
+    return simulate_eight(settings_of(seed, errors, _DURATION_S))
 
 
 def _fixes(
-    run: LivedRun, seed: int, period_ns: int = FIX_NS, sigma: Sequence[float] = _MOCAP_SIGMA
+    run: LivedRun, seed: int, period_ns: int = _MOCAP_NS, sigma: Sequence[float] = _MOCAP_SIGMA
 ) -> FixRows:
     """Absolute fixes of all robots, in order of arrival; `sigma` is of x, y [m] and heading [rad]."""
     rng, robots = np.random.default_rng([seed, 32]), len(run.swarm.robots)
@@ -296,6 +305,35 @@ def _sure_detections(seed: int) -> Fault:
     return _faulty(run, "detections", good, wrong, {f"epuck{observer + 1}"}, {observer, other}, span_s)
 
 
+_IMU = ImuModel(turn_noise_density=3e-4, turn_scale_sigma=0.005, turn_bias_sigma=0.01)
+"""A cheap MEMS gyroscope, three times as noisy as the data sheet of an MPU-6050 says (0.005 deg/s/Hz^0.5)."""
+_IMU_HZ = 50.0
+
+
+def _turn_rates(rng: np.random.Generator, run: LivedRun) -> TurnRateRows:
+    """Readings of an IMU on each robot, with bias and scale drawn from their sigmas, in order of arrival."""
+    period_ns = round(1e9 / _IMU_HZ)
+    stamp_ns = np.arange(run.start_ns, run.end_ns, period_ns)
+    robots, kept = len(run.swarm.robots), math.exp(-1.0 / _IMU_HZ / _IMU.turn_bias_time_s)
+    rates = []
+    for robot in range(robots):
+        turn = np.gradient(np.unwrap(run.truth.at(robot, stamp_ns)[:, 2]), 1e-9 * period_ns)
+        # a Gauss-Markov bias, in its stationary distribution
+        bias, step = np.empty(stamp_ns.size), _IMU.turn_bias_sigma * math.sqrt(1.0 - kept**2)
+        bias[0] = _IMU.turn_bias_sigma * rng.standard_normal()
+        for k, noise in enumerate(step * rng.standard_normal(stamp_ns.size - 1)):
+            bias[k + 1] = kept * bias[k] + noise
+        white = _IMU.turn_noise_density * math.sqrt(_IMU_HZ) * rng.standard_normal(stamp_ns.size)
+        scale = _IMU.turn_scale * (1.0 + _IMU.turn_scale_sigma * rng.standard_normal())
+        rates.append((turn - bias - _IMU.turn_bias) / scale + white)
+    stamps, velocity = np.tile(stamp_ns, robots), np.zeros((robots * stamp_ns.size, 3))
+    velocity[:, 2] = np.concatenate(rates)
+    unknown = np.full(velocity.shape, np.nan)
+    arrivals = arrival_ns(rng, stamps, CAMERA_LATENESS)
+    who = np.repeat(np.arange(robots), stamp_ns.size)
+    return in_order_of_arrival([TurnRateRows(who, stamps, velocity, unknown[:, 0], unknown, arrivals)])
+
+
 def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s: Span = FAULT_S) -> Fault:
     """The gyroscope of a robot breaks within 5 s, in every other seed those of all robots.
 
@@ -306,8 +344,10 @@ def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s:
         break_it: Makes wrong rates (k, 3) of those of a robot from the fault on.
         span_s: Begin and end of the fault.
     """
-    rng, run = _rng(seed), with_imus(_eight(seed, W0))
-    good, which = simulate_gyroscopes(rng, run, IMU), int(rng.integers(5))
+    rng, run = _rng(seed), _eight(seed, W0)
+    robots = tuple(replace(robot, imu=_IMU) for robot in run.swarm.robots)
+    run = replace(run, swarm=replace(run.swarm, robots=robots))
+    good, which = _turn_rates(rng, run), int(rng.integers(5))
     broken = [which] if seed % 2 else range(len(run.swarm.robots))
     span_s = (span_s[0] + float(rng.uniform(0.0, 5.0)), span_s[1])
     order, velocity = np.argsort(good.stamp_ns, kind="stable"), good.velocity.copy()
@@ -321,7 +361,7 @@ def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s:
 
 def _on_another_axis(seed: int) -> Fault:
     """The yaw rate appears on another axis, and noise on the vertical one."""
-    rng, sigma = _rng(seed), IMU.turn_noise_density * math.sqrt(RATE_HZ)
+    rng, sigma = _rng(seed), _IMU.turn_noise_density * math.sqrt(_IMU_HZ)
 
     def on_its_side(rates: FloatArray) -> FloatArray:
         return np.roll(rates, 1 + int(seed % 3 == 0), axis=1) + sigma * rng.standard_normal(rates.shape)
@@ -329,10 +369,63 @@ def _on_another_axis(seed: int) -> Fault:
     return _gyroscopes(seed, on_its_side)
 
 
+_ANCHORS = ((-4.0, -4.0, 2.0), (4.0, -4.0, 2.4), (4.0, 4.0, 2.0), (-4.0, 4.0, 2.4))
+_RADIOS, _ANTENNA_Z, _RANGE_SIGMA = 3, 0.3, 0.05  # Robots, and their radios
+_ARENA_M, _RADIO_STEP_NS, _RANGE_STEPS = 2.4, 50_000_000, 10  # Each link measures twice a second
+
+
+def _among_anchors(seed: int) -> tuple[LivedRun, RangeRows]:
+    """Three robots that drive arcs between four anchors: the run, and its ranges in order of arrival."""
+    # drive arcs at random rates, and back to the middle from outside; odometry does not know of slip
+    rng, rate = np.random.default_rng(seed), np.zeros(_RADIOS)
+    model, sigma = OdometryModel(wheel_separation=0.15, wheel_noise=2e-5), StartSigma(0.05, 0.05, 0.05)
+    stamp_ns = START_NS + _RADIO_STEP_NS * np.arange(round(1e9 * _DURATION_S / _RADIO_STEP_NS) + 1)
+    truth, reported = np.zeros((2, stamp_ns.size, _RADIOS, 3))
+    truth[0, :, :2] = rng.uniform(-1.8, 1.8, (_RADIOS, 2))
+    truth[0, :, 2] = rng.uniform(-math.pi, math.pi, _RADIOS)
+    reported[0] = rng.uniform(-1.0, 1.0, (_RADIOS, 3))
+    wheels, speed, step_s = Drive(model.wheel_separation, 1.0), np.full(_RADIOS, 0.3), 1e-9 * _RADIO_STEP_NS
+    for k, pose in enumerate(truth[:-1]):
+        if k % 30 == 0:
+            rate = rng.uniform(-1.0, 1.0, _RADIOS)
+        away = se2.wrap_angle(np.arctan2(-pose[:, 1], -pose[:, 0]) - pose[:, 2])
+        outside = np.abs(pose[:, :2]).max(axis=1) > _ARENA_M
+        turn = np.where(outside, np.clip(2.0 * away, -1.5, 1.5), rate)
+        slip = math.sqrt(model.wheel_noise) * rng.standard_normal((2, _RADIOS)).T
+        truth[k + 1] = roll(pose, speed, turn, wheels, step_s, slip)
+        reported[k + 1] = roll(reported[k], speed, turn, wheels, step_s, np.zeros_like(slip))
+    records = np.zeros(reported.shape[:2], ODOMETRY_DTYPE)
+    records["robot"], records["pose"] = np.arange(_RADIOS), reported
+    records["stamp_ns"] = records["arrival_ns"] = stamp_ns[:, None]
+    # describe the robots, with uncertain starts
+    robots = []
+    for k, pose in enumerate(truth[0] + 0.05 * rng.standard_normal((_RADIOS, 3))):
+        x, y, theta = pose.tolist()
+        radio = UwbDevice(k + 1, z=_ANTENNA_Z, range_sigma=_RANGE_SIGMA)
+        placed = {"start": (x, y, theta), "start_sigma": sigma}
+        robots.append(Robot(f"robot_{k}", odometry=model, camera=None, uwb=radio, **placed))
+    swarm = Swarm(
+        tuple(robots),
+        anchors=tuple(Anchor(100 + k, *place, range_bias_sigma=0.0) for k, place in enumerate(_ANCHORS)),
+    )
+    run = LivedRun(swarm, Trajectories(stamp_ns, truth), records.reshape(-1))
+    # ranges of each link in turn
+    parts = []
+    for number, (robot, anchor) in enumerate(np.ndindex(_RADIOS, len(_ANCHORS))):
+        measured = slice(1 + number % _RANGE_STEPS, None, _RANGE_STEPS)
+        at_ns, place = stamp_ns[measured], np.insert(truth[measured, robot, :2], 2, _ANTENNA_Z, axis=-1)
+        distance = np.linalg.norm(np.array(_ANCHORS[anchor]) - place, axis=1)
+        distance += _RANGE_SIGMA * rng.standard_normal(at_ns.size)
+        who, zero = np.full_like(at_ns, robot), np.zeros_like(distance)
+        device = np.full_like(at_ns, 100 + anchor).astype(np.uint64)
+        arrivals_ns = arrival_ns(rng, at_ns, CAMERA_LATENESS)
+        parts.append(RangeRows(who, at_ns, device, zero.astype(np.uint64), distance, zero, arrivals_ns))
+    return run, in_order_of_arrival(parts)
+
+
 def _uwb_repeated(seed: int) -> Fault:
     """Ranges of all radios are measured twice a second and published five times each."""
-    world = simulate(Plan(duration_s=_DURATION_S, steps_per_range=10), seed)
-    run, good = world.lived(), world.range_rows()
+    run, good = _among_anchors(seed)
     again = [
         good._replace(stamp_ns=good.stamp_ns + late_ns, arrival_ns=good.arrival_ns + late_ns)
         for late_ns in range(0, 500_000_000, 100_000_000)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 
-from bench.lidar import buildings, cases, crowd, real, starts
-from bench.shared.common import ProgressLine, table, write_figures
+from bench.lidar import buildings, cases, crowd, known_map, real, starts
+from bench.shared.common import ProgressLine, options_of, table, write_figures
 
 
 def main() -> None:
     """Measure, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--starts", type=int, default=50, help="number of random starts in each map")
     parts: Mapping[str, Callable[[int], dict[str, float]]] = {
         "cases": lambda _: cases.measure(),
         "buildings": lambda _: {
@@ -23,13 +20,17 @@ def main() -> None:
             count, real.MAP if real.MAP.is_file() else None, ProgressLine("starts")
         ),
         "crowd": lambda count: crowd.measure(count, ProgressLine("crowd")),
+        "lidar_map": lambda count: known_map.measure(range(1, count + 1), ProgressLine("lidar_map")),
     }
-    parser.add_argument("--seeds", type=int, default=2, help="number of drives of a crowd")
-    parser.add_argument("--parts", nargs="+", choices=[*parts], default=[*parts], help="what to measure")
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__,
+        starts=(50, "number of random starts in each map"),
+        seeds=(2, "number of drives of a crowd and in known maps"),
+        parts=(tuple(parts), "what to measure", tuple(parts)),
+    )
     figures: dict[str, float] = {}
     for name in arguments.parts:
-        figures |= parts[name](arguments.seeds if name == "crowd" else arguments.starts)
+        figures |= parts[name](arguments.seeds if name in {"crowd", "lidar_map"} else arguments.starts)
     print(table(["figure", "value"], [[key, value] for key, value in figures.items()]))
     print(f"Written: {write_figures('lidar', figures)}")
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.inputs.lidar_map import exact_map
+from bench.lidar.known_map import ODOMETRY, exact_map, inputs_of_sweeps, sweep
 from bench.pushbot.exploration import PERIOD_S, PushBotNoise
 from bench.pushbot.lidar import BEAMS, LIDAR, NEAREST, ODOMETRY_STEPS, SWEEP_S, SWEEP_STEPS, LidarBody
 from bench.pushbot.mapping import LIDAR_SLIPS
@@ -30,18 +30,12 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
-from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.offline.map_replay import map_figures
 from swarm_loc_estimator.offline.metrics import is_misleading
-from swarm_loc_estimator.sensors.inputs import Batch
-from swarm_loc_estimator.sensors.lidar import ScanRows
-from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 
-_ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
 _START = StartSigma(0.02, 0.02, math.radians(1.0))
 _COLUMNS, _ROWS, _SQUARE_M, _FREE_M = 5, 4, 1.6, 0.35
 _RADIUS, _FAR_M, _RUN_S, _SETTLED_S, _MAPPED_S = 0.15, 12.0, 60.0, 5.0, 20.0
@@ -116,7 +110,7 @@ def _run(seed: int, path: Path | None, *, scans: bool, sees: bool, radius: float
     bodies = _bodies(seed)
     lidar = replace(LIDAR, max_range=_FAR_M, robot_radius=radius)
     robots = [
-        Robot(f"r{k}", lidar=lidar, odometry=_ODOMETRY, start=_start(body), start_sigma=_START)
+        Robot(f"r{k}", lidar=lidar, odometry=ODOMETRY, start=_start(body), start_sigma=_START)
         for k, body in enumerate(bodies)
     ]
     estimator, cpu_s, count = Estimator(Swarm(tuple(robots), map=path)), 0.0, 0
@@ -129,7 +123,7 @@ def _run(seed: int, path: Path | None, *, scans: bool, sees: bool, radius: float
         if step and step % SWEEP_STEPS == 0:
             begin = step - SWEEP_STEPS
             ranges = [_ranges(bodies, k, begin, sees=sees) for k in range(len(bodies))] if scans else []
-            batch = _batch(now_ns, waiting, ranges)
+            batch = inputs_of_sweeps(now_ns, waiting, ranges, _FAR_M)
             waiting, begin_s = [], time.process_time()
             estimator.receive(batch)
             estimate = estimator.tick(now_ns)
@@ -155,29 +149,6 @@ def _start(body: CrowdBody) -> Pose2:
     return float(x), float(y), float(theta)
 
 
-def _batch(now_ns: int, odometry: list[tuple[int, int, FloatArray]], ranges: list[FloatArray]) -> Batch:
-    """Odometry since the last sweeps, and these sweeps."""
-    robots, stamps = (np.array([one[k] for one in odometry]) for k in (0, 1))
-    poses = np.array([pose for _, _, pose in odometry])
-    rows: dict[str, Any] = {
-        "odometry": OdometryRows(robots, stamps, poses, np.full_like(poses, np.nan), stamps)
-    }
-    begin_ns = now_ns - round(SWEEP_S * 1e9)
-    if ranges:
-        scans = np.empty(len(ranges), dtype=object)
-        for k, one in enumerate(ranges):
-            scans[k] = _scan(begin_ns, one)
-        at_ns = np.full(len(ranges), begin_ns)
-        rows["scans"] = ScanRows(np.arange(len(ranges)), at_ns, scans, np.full(len(ranges), now_ns))
-    return Batch.of(begin_ns, now_ns, **rows)
-
-
-def _scan(begin_ns: int, ranges: FloatArray) -> ScanMessage:
-    """The scan of a sweep that began at a time."""
-    turn = 2.0 * math.pi / BEAMS
-    return ScanMessage(begin_ns, 0.0, 2.0 * math.pi, turn, SWEEP_S / BEAMS, NEAREST, _FAR_M, ranges)
-
-
 def _mapped(seed: int, *, sees: bool, radius: float) -> tuple[float, float]:
     """Map the hall by all robots; RMS error of stops, and mean distance of walls from their places [m]."""
     bodies, mapper = _bodies(seed), CooperativeMapper()
@@ -196,7 +167,7 @@ def _mapped(seed: int, *, sees: bool, radius: float) -> tuple[float, float]:
                 feed.add(k, MapperInput.ODOMETRY, data)
         for k in range(len(bodies)) if step and step % SWEEP_STEPS == 0 else ():
             begin_ns = now_ns - round(SWEEP_S * 1e9)
-            fields = _scan(begin_ns, _ranges(bodies, k, step - SWEEP_STEPS, sees=sees))._asdict()
+            fields = sweep(begin_ns, _ranges(bodies, k, step - SWEEP_STEPS, sees=sees), _FAR_M)._asdict()
             header = {"stamp": fields.pop("stamp_ns"), "frame_id": fields.pop("frame_id")}
             fields |= {"header": header, "ranges": fields["ranges"].astype(np.float32)}
             feed.add(k, MapperInput.SCAN, encode(fields, LASER_SCAN))

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from bench.inputs.lidar_map import exact_map
+from bench.lidar.known_map import ODOMETRY, exact_map, inputs_of_sweeps
 from bench.pushbot.exploration import PERIOD_S, PushBotNoise
-from bench.pushbot.lidar import BEAMS, LIDAR, NAME, NEAREST, ODOMETRY_STEPS, SWEEP_S, SWEEP_STEPS, LidarBody
+from bench.pushbot.lidar import BEAMS, LIDAR, NAME, NEAREST, ODOMETRY_STEPS, SWEEP_STEPS, LidarBody
 from bench.pushbot.mapping import LIDAR_SLIPS, PLANS
 from bench.shared.common import ProgressLine
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
@@ -30,16 +30,10 @@ from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map, save_map
-from swarm_loc_estimator.mapping.messages import ScanMessage
-from swarm_loc_estimator.sensors.inputs import Batch
-from swarm_loc_estimator.sensors.lidar import ScanRows
-from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 
-_ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
 _UNTIL_S, _AFTER_S = 40.0, 3.0  # How long a robot drives unfound, and after it is found
 _WRONG_M, _WRONG_TURN = 0.3, math.radians(15.0)
 _CLEAR_M, _HOPS_M, _TRIES = 0.3, (0.6, 5.0), 400
@@ -129,16 +123,16 @@ def bodies(grid: OccupancyMap, far_m: float, seeds: range) -> Iterator[tuple[int
 
 def try_start(path: Path, body: GridBody) -> Start:
     """Drive a robot without a start until some time after it is found."""
-    robot = Robot(NAME, lidar=replace(LIDAR, max_range=body.far_m), odometry=_ODOMETRY)
+    robot = Robot(NAME, lidar=replace(LIDAR, max_range=body.far_m), odometry=ODOMETRY)
     estimator, found_s, wrong = Estimator(Swarm((robot,), map=path)), math.inf, False
     cpu_s: list[float] = []
-    odometry: list[tuple[int, FloatArray]] = []
+    odometry: list[tuple[int, int, FloatArray]] = []
     for step in range(round(_UNTIL_S / PERIOD_S) + 1):
         now_ns = round(step * PERIOD_S * 1e9)
         if step % ODOMETRY_STEPS == 0:
-            odometry.append((now_ns, body.odometry))
+            odometry.append((0, now_ns, body.odometry))
         if step and step % SWEEP_STEPS == 0:
-            batch = _batch(now_ns, odometry, body.ranges(step - SWEEP_STEPS), body.far_m)
+            batch = inputs_of_sweeps(now_ns, odometry, [body.ranges(step - SWEEP_STEPS)], body.far_m)
             odometry, begin_s = [], time.process_time()
             estimator.receive(batch)
             estimate = estimator.tick(now_ns)
@@ -154,21 +148,6 @@ def try_start(path: Path, body: GridBody) -> Start:
     scans = recent.verdicts[recent.measurements.model == SCAN]
     ambiguous = math.isinf(found_s) and bool(scans.size) and scans[-1] == Verdict.SEVERAL_PLACES
     return Start(math.isfinite(found_s), wrong, ambiguous, found_s, sum(cpu_s), max(cpu_s))
-
-
-def _batch(now_ns: int, odometry: list[tuple[int, FloatArray]], ranges: FloatArray, far_m: float) -> Batch:
-    """Odometry since the last sweep, and this sweep."""
-    stamps = np.array([at_ns for at_ns, _ in odometry])
-    zeros, nothing = np.zeros(len(stamps), dtype=np.int64), np.zeros((len(stamps), 3))
-    poses = np.array([pose for _, pose in odometry])
-    rows = OdometryRows(zeros, stamps, poses, np.full_like(nothing, np.nan), stamps)
-    begin_ns = now_ns - round(SWEEP_S * 1e9)
-    turn = 2.0 * math.pi / BEAMS
-    scan = np.empty(1, dtype=object)
-    scan[0] = ScanMessage(begin_ns, 0.0, 2.0 * math.pi, turn, SWEEP_S / BEAMS, NEAREST, far_m, ranges)
-    stamp = np.array([begin_ns])
-    scans = ScanRows(np.zeros(1, dtype=np.int64), stamp, scan, np.array([now_ns]))
-    return Batch.of(begin_ns, now_ns, odometry=rows, scans=scans)
 
 
 def measure(count: int, real: Path | None, say: ProgressLine) -> dict[str, float]:

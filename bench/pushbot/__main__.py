@@ -1,7 +1,7 @@
-"""PushBots: event tracker, laser calibration, driver, and maps made by one robot and by many.
+"""PushBots: maps made by one robot and by many.
 
     make bench-pushbot
-    make bench-pushbot ARGS="--parts mapping --seeds 3 --team-seeds 1"
+    make bench-pushbot ARGS="--seeds 3 --team-seeds 1"
 
 Maps are made of simulated distances by the core that the mapper node runs: turns of 1 rad/s, drives of
 .2 m/s, distance noise 1.5 %, .64 deg a turn, .3 deg a root metre, slip 0, 2 and 5 % in turn, .1 px (px3:
@@ -17,55 +17,26 @@ the graph are compared, and sweep_ms is the CPU time of a sweep, of those that a
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
-from bench.shared.common import write_figures
-
-PARTS = ("tracker", "calibration", "driver", "mapping")
+from bench.pushbot.mapping import MappingEffort, measure_mapping
+from bench.shared.common import options_of, write_figures
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    options = _parser().parse_args(arguments)
-    figures: dict[str, float] = {}
-    for part in options.parts:
-        figures |= _measure(part, options)
-    print(f"figures: {write_figures('pushbot', figures)}")
-    return 0
-
-
-def _measure(part: str, options: argparse.Namespace) -> dict[str, float]:
-    """The figures of one part; each imports what it alone needs."""
-    if part == "tracker":
-        from bench.pushbot.tracker import measure_tracker  # noqa: PLC0415
-
-        return measure_tracker(options.tracker_seeds)
-    if part == "calibration":
-        from bench.pushbot.calibration import measure_calibration  # noqa: PLC0415
-
-        return measure_calibration(options.tracker_seeds)
-    if part == "driver":
-        from bench.pushbot.driver import measure_driver  # noqa: PLC0415
-
-        return measure_driver(options.tracker_seeds)
-    from bench.pushbot.mapping import MappingEffort, measure_mapping  # noqa: PLC0415
-
-    return measure_mapping(
-        MappingEffort(options.seeds, options.team_seeds, options.minutes, options.processes)
+    options = options_of(
+        __doc__,
+        arguments,
+        seeds=(20, "of each of three halls with one robot"),
+        team_seeds=(6, "of teams, and other halls"),
+        minutes=(20.0, "of one robot; teams get half"),
+        processes=(2, "at a time, 2 at most"),
     )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure")
-    parser.add_argument("--tracker-seeds", type=int, default=5, help="of tracker, calibration and driver")
-    parser.add_argument("--seeds", type=int, default=20, help="of each of three halls with one robot")
-    parser.add_argument("--team-seeds", type=int, default=6, help="of teams, and other halls")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of one robot; teams get half")
-    parser.add_argument("--processes", type=int, default=2, help="at a time, 2 at most")
-    return parser
+    effort = MappingEffort(options.seeds, options.team_seeds, options.minutes, options.processes)
+    print(f"figures: {write_figures('pushbot', measure_mapping(effort))}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -10,12 +10,11 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_visible, ray_distance
-from swarm_loc_estimator import SCAN_TURN, UNSEEN, Goal, LightSightings, Readings
+from swarm_loc_estimator import SCAN_TURN, UNSEEN, CooperativeMapper, LightSightings, Readings
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
@@ -226,25 +225,6 @@ START_TURNS = ((0.25 * math.pi, 1.0 / 6.0), (0.25 * math.pi, 1.0 / 6.0), (4.0 * 
 _REST_S = 1.2
 
 
-class Mapper(Protocol):
-    """A mapper that builds a map from readings and sets goals."""
-
-    def join(self, pose: FloatArray, sigma: FloatArray) -> int:
-        """Add a robot; returns its number."""
-
-    def add_readings(self, robot: int, readings: Readings) -> None:
-        """Process readings."""
-
-    def add_lights(self, robot: int, sightings: LightSightings) -> None:
-        """Process sightings of lights."""
-
-    def pose(self, robot: int) -> FloatArray | None:
-        """The pose of a robot now."""
-
-    def goal(self, robot: int) -> Goal | None:
-        """The next goal of a robot."""
-
-
 @dataclass(frozen=True)
 class Arrival:
     """One stop of a robot."""
@@ -261,7 +241,7 @@ class Exploration:
     """Robots that explore a floor plan with one mapper."""
 
     plan: FloorPlan  # The hall
-    mapper: Mapper  # Makes the map
+    mapper: CooperativeMapper  # Makes the map
     rng: np.random.Generator  # Source of all noise
     use_lights: bool = True  # Whether the mapper gets sightings of lights
     robots: dict[int, KinematicPushBot] = field(default_factory=dict)  # Those that have joined, by number

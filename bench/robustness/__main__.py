@@ -20,29 +20,29 @@ folders and files are in the way; `kills` interrupts and kills commands at rando
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 
 from bench.robustness import clocks, files, kills, live_restarts, load, protocols, restarts, stamps
-from bench.shared.common import ProgressLine, table, write_figures
+from bench.shared.common import ProgressLine, options_of, table, write_figures
 
 _PARTS = ("stamps", "restart", "protocols", "files", "kills", "load", "time")
 
 
 def main() -> None:
     """Measure, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--streams", type=int, default=10_000, help="corrupted streams of each protocol")
-    parser.add_argument("--seeds", type=int, default=5, help="runs with wrong stamps of each kind")
-    parser.add_argument("--cuts", type=int, default=20, help="full disks of each command")
-    parser.add_argument("--kills", type=int, default=10, help="signals of each kind to each command")
-    parser.add_argument("--minutes", type=float, default=10.0, help="at three times the load that fits")
-    parser.add_argument("--image-rate", type=float, default=0.0, help="load instead of three times that [Hz]")
-    parser.add_argument("--restart-seeds", type=int, default=20, help="of each hall in which drivers restart")
-    parser.add_argument("--live-restarts", type=int, default=20, help="in a whole graph of each hall")
-    parser.add_argument("--loops", type=int, default=20, help="of a bag")
-    parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__,
+        streams=(10_000, "corrupted streams of each protocol"),
+        seeds=(5, "runs with wrong stamps of each kind"),
+        cuts=(20, "full disks of each command"),
+        kills=(10, "signals of each kind to each command"),
+        minutes=(10.0, "at three times the load that fits"),
+        image_rate=(0.0, "load instead of three times that [Hz]"),
+        restart_seeds=(20, "of each hall in which drivers restart"),
+        live_restarts=(20, "in a whole graph of each hall"),
+        loops=(20, "of a bag"),
+        parts=(_PARTS, "what to measure", _PARTS),
+    )
     figures: dict[str, float] = {}
 
     def note(of_part: dict[str, float]) -> None:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.integrity.faults import CLEAN, settings_of, simulate
+from bench.integrity.faults import CLEAN, settings_of
+from bench.scenarios.eight_run import simulate_eight
 from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import ProgressLine
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of
@@ -80,7 +81,7 @@ def measure(seeds: int, say: ProgressLine) -> dict[str, float]:
         found = []
         for seed in range(1, seeds + 1):
             say(f"{name}, seed {seed}")
-            run = simulate(settings_of(seed, CLEAN, _DURATION_S))
+            run = simulate_eight(settings_of(seed, CLEAN, _DURATION_S))
             found.append(misleading_share(with_stamps(run, change, np.random.default_rng([seed, 7]))))
         shares += [share for share, _ in found]
         figures[f"stamps.{name}.misleading_share"] = float(np.mean([share for share, _ in found]))

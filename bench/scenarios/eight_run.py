@@ -7,7 +7,7 @@ sightings.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,29 +37,14 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, 
 from swarm_loc_vision.markers.families import family_named
 
 WALL_MARKER_PITCH = 0.4
-
-
 MARKER_HEIGHT = 0.08
-
-
 FACE_DISTANCE = 0.033
-
-
 FACE_NAMES = ("front_left", "left", "back", "right", "front_right")
-
-
 CAMERA = CameraMount(x=0.03, z=0.08)
-
-
 VIEW = View(field_of_view=math.radians(60.0), nearest=0.12, farthest=1.5, incidence=math.radians(65.0))
 
-
 WHEEL_SEPARATION = 0.053
-
-
 STEP_NS = 5_000_000
-
-
 _FIRST_FACE_ID, _FIRST_LANDMARK_ID = 10, 100
 
 
@@ -77,12 +62,23 @@ class EightSettings:
     start_known: bool = True  # Whether the description has the start poses
 
 
-def simulate_eight(settings: EightSettings) -> SimulatedRun:
-    """Drive the eight and record odometry and sightings."""
+def simulate_eight(
+    settings: EightSettings,
+    as_it_is: Callable[[Swarm], Swarm] = lambda described: described,
+    moved: Callable[[Trajectories], Trajectories] = lambda truth: truth,
+) -> SimulatedRun:
+    """Drive the eight and record odometry and sightings.
+
+    Args:
+        settings: Of the run.
+        as_it_is: From the described swarm to the one that cameras see.
+        moved: Changes true poses without any odometry.
+    """
     rng = np.random.default_rng(settings.seed)
-    swarm, truth, odometry = drive_eight(rng, settings)
+    swarm, driven, odometry = drive_eight(rng, settings)
+    truth = moved(driven)
     exposures = camera_exposures(rng, settings.robots, truth)
-    frames, sightings = observe_markers(rng, swarm, truth, exposures, VIEW, settings.errors)
+    frames, sightings = observe_markers(rng, as_it_is(swarm), truth, exposures, VIEW, settings.errors)
     return SimulatedRun(swarm, truth, odometry, frames, sightings)
 
 
@@ -101,11 +97,7 @@ def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swar
 
 
 def drive_robots(
-    rng: np.random.Generator,
-    settings: EightSettings,
-    start: FloatArray,
-    control: Controller,
-    first_face_id: int = _FIRST_FACE_ID,
+    rng: np.random.Generator, settings: EightSettings, start: FloatArray, control: Controller
 ) -> tuple[Swarm, Trajectories, Records]:
     """Drive robots from `start` (N, 3): the swarm as described, where it went, and its odometry."""
     model = Drive(WHEEL_SEPARATION, settings.errors.wheel_noise, settings.errors.turn_slip)
@@ -113,7 +105,7 @@ def drive_robots(
     truth, odometry = record_drive(
         rng, start, control, model, step_ns=STEP_NS, duration_s=duration_s, odometry_rate_hz=rate_hz
     )
-    return describe(settings, start, first_face_id), truth, odometry
+    return describe(settings, start), truth, odometry
 
 
 def describe(settings: EightSettings, start: FloatArray, first_face_id: int = _FIRST_FACE_ID) -> Swarm:

@@ -1,4 +1,4 @@
-"""The command of this folder as those of the packages."""
+"""The command of this folder as those of the packages; `bench.robustness` finds it by its name."""
 
 from __future__ import annotations
 

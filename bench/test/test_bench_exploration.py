@@ -1,4 +1,4 @@
-"""PushBots in floor plans: motion and readings, a short exploration, and its bag through the mapper."""
+"""PushBots in floor plans: motion and readings, a short exploration, and its bag."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,6 @@ from bench.pushbot.bag import PushbotBagSettings, main, write_pushbot_bag
 from bench.pushbot.exploration import Exploration, KinematicPushBot, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan, outline
 from swarm_loc_drivers.sim.pushbot.optics import laser_hz
-from swarm_loc_estimator.cli.replay_map import main as replay_map
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
@@ -120,20 +119,6 @@ def test_five_robots_whose_starts_are_hardly_known_all_find_their_places() -> No
     assert {one.robot for one in exploration.arrivals} == set(range(5))
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.05
     assert np.degrees(np.abs(wrap_angle(errors[:, 2]))).max() < 2.5
-
-
-def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
-    bag = tmp_path / "bag"
-    count = write_pushbot_bag(PushbotBagSettings(3, 25.0, 1, "corridor", 0.02), bag, "Of a test.")
-    assert count > 2 * 25 * 50
-    files = []
-    for name in ("a", "b"):
-        out = tmp_path / name
-        arguments = [str(bag), "--out", str(out), "--walls", str(bag / "walls.csv"), "--led", "pushbot1=1000"]
-        assert replay_map(arguments) == 0
-        files.append({path.name: path.read_bytes() for path in out.iterdir()})
-    assert files[0] == files[1]
-    assert set(files[0]) == {"map.yaml", "map.pgm", "map.png", "stops.csv"}
 
 
 def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> None:

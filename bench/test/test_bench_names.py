@@ -1,12 +1,10 @@
-"""Benchmarks can be run by their names; readers and sweeps find the same before their speed is compared."""
+"""Benchmarks can be run by their names; readers find the same before their speed is compared."""
 
 import json
 import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
-from typing import cast
 
 import pytest
 
@@ -15,7 +13,6 @@ from bench.peers import reading
 from bench.shared.bags import copy_part
 from bench.shared.common import DEMO_BAG
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
-from swarm_loc_estimator.offline.sweep.sweep import read_sweep
 
 
 @pytest.mark.parametrize("module", BENCHMARKS.values())
@@ -60,22 +57,3 @@ def test_a_reader_that_finds_something_else_is_not_compared(
     monkeypatch.setitem(reading.READERS["mcap"], "forgetful", forgetful)
     with pytest.raises(RuntimeError, match=r"forgetful reads something else from .* as mcap"):
         reading.measure(second, ODOMETRY, times=1)
-
-
-@pytest.fixture
-def sweep() -> ModuleType:
-    """The benchmark of sweeps, where Ray is installed."""
-    return cast("ModuleType", pytest.importorskip("bench.sweep", exc_type=ImportError))
-
-
-def test_both_sweeps_have_the_same_replays(tmp_path: Path, sweep: ModuleType) -> None:
-    sweep.prepare(tmp_path, 0.5)
-    one, two = (read_sweep(tmp_path / f"on{workers}.yaml") for workers in (1, 2))
-    assert (one.workers, two.workers) == (1, 2)
-    assert len(one.jobs) == sweep.REPLAYS
-    assert [job.key for job in one.jobs] == [job.key for job in two.jobs]
-
-
-def test_evo_finds_the_same_errors(tmp_path: Path, sweep: ModuleType) -> None:
-    sweep.prepare(tmp_path, 5.0)
-    assert sweep.evo_difference_m(tmp_path / sweep.NAMES[0], tmp_path) < 1e-9

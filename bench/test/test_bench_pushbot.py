@@ -5,9 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.pushbot.calibration import calibrate
-from bench.pushbot.driver import robots_on_two_cores
-from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
 from bench.pushbot.runs import RunResult, RunSettings, coverage, run, wall_distance_cm, wall_points
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
@@ -31,12 +28,6 @@ def test_every_kind_of_run_is_planned() -> None:
     assert len({one.seed for one in jobs["ring"]}) == 20
     assert jobs["five_robots"][0].minutes == 10.0
     assert [(one.slip, one.seed) for one in jobs["lidar.ring"]] == [(0.02, 1), (0.035, 2), (0.05, 3)]
-
-
-def test_what_two_cores_carry_counts_only_events_that_came() -> None:
-    flow = Measured(0.5 * RATE, 0.0, driver=0.06, tracker=0.04, feed=0.1, others=0.0)
-    assert robots_on_two_cores(flow) == pytest.approx(10.0)
-    assert robots_on_two_cores(flow._replace(events_per_s=RATE)) == pytest.approx(20.0)
 
 
 def _result(seed: int, **values: float) -> RunResult:
@@ -70,14 +61,11 @@ def test_a_laser_that_sees_no_walls_at_first_misleads_nobody() -> None:
     assert found.heading_deg < 15.0
 
 
-def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
-    settings = RunSettings("office", 0.02, 5, minutes=2.0)
-    first, second = run(settings), run(settings)
-    assert first.position_cm == second.position_cm
-    assert first.worst_cm < 30.0
-    assert 0.05 < first.coverage < 0.9
-    assert first.wall_aligned_cm < 4.0
-    assert np.array_equal(first.cells, second.cells)
+def test_a_short_run_is_scored() -> None:
+    found = run(RunSettings("office", 0.02, 5, minutes=2.0))
+    assert found.worst_cm < 30.0
+    assert 0.05 < found.coverage < 0.9
+    assert found.wall_aligned_cm < 4.0
 
 
 def test_a_lidar_maps_a_hall_with_wheels_that_slip() -> None:
@@ -89,9 +77,3 @@ def test_a_lidar_maps_a_hall_with_wheels_that_slip() -> None:
     figures = figures_of({"lidar.office": [found]})
     assert figures["lidar.office.diverged"] == 0.0
     assert figures["lidar.office.worst_wall_cm"] == found.wall_cm
-
-
-def test_the_logarithm_of_the_paper_is_tens_of_centimetres_off() -> None:
-    one = calibrate(1)
-    assert np.sqrt(np.mean(one.hyperbola_cm**2)) < 1.0
-    assert np.sqrt(np.mean(one.logarithm_cm**2)) > 20.0

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.integrity.faults import CLEAN, settings_of, simulate
+from bench.integrity.faults import CLEAN, settings_of
 from bench.robustness.protocols import Stream
 from bench.robustness.robots import PROTOCOLS, Run
 from bench.robustness.stamps import CHANGES, misleading_share, with_stamps
 from bench.robustness.wire import NONSENSE, PARTIAL
+from bench.scenarios.eight_run import simulate_eight
 from swarm_loc_drivers.common.odometry import OdometryState
 
 SEEDS = st.integers(0, 2**31)
@@ -56,7 +57,7 @@ def test_a_defect_of_a_driver_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", ["jitter_90", "early", "late", "twice"])
 def test_wrong_stamps_of_odometry_make_no_pose_misleading(name: str) -> None:
-    run = simulate(settings_of(3, CLEAN, 6.0))
+    run = simulate_eight(settings_of(3, CLEAN, 6.0))
     share, worst_m = misleading_share(with_stamps(run, CHANGES[name], np.random.default_rng(3)))
     assert share <= 0.001
     assert worst_m < 0.02

@@ -1,11 +1,9 @@
 """The page in a real Chromium: what it shows, what it orders, and what it must not do."""
 
-import queue
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.watch.page import page as page_of
 
-PATIENCE_S = 15.0
 BLUE = (0x00, 0x72, 0xB2)
 
 
@@ -63,7 +60,7 @@ def test_dragging_sets_a_pose_once_it_is_confirmed(page: WatchedPage, swarm: Wat
         page.page.mouse.up()
         page.page.click(f"#ask button:has-text('{answer}')")
         page.until("!document.getElementById('ask').open")
-    command = next_order(swarm)
+    command = swarm.next_order()
     assert (command["do"], command["robot"]) == ("set_pose", 1)
     assert command["pose"] == pytest.approx([0.1, 0.2, np.pi / 2], abs=0.01)
     page.until("document.getElementById('said').textContent == 'done: set_pose'")
@@ -73,7 +70,7 @@ def test_dragging_sets_a_pose_once_it_is_confirmed(page: WatchedPage, swarm: Wat
 def test_a_reset_is_ordered_once_it_is_confirmed(page: WatchedPage, swarm: WatchedSwarm) -> None:
     page.page.click("#reset")
     page.page.click("#yes")
-    assert next_order(swarm)["do"] == "reset"
+    assert swarm.next_order()["do"] == "reset"
 
 
 def test_a_robot_is_driven_while_a_key_is_held(page: WatchedPage, swarm: WatchedSwarm) -> None:
@@ -82,7 +79,7 @@ def test_a_robot_is_driven_while_a_key_is_held(page: WatchedPage, swarm: Watched
     page.page.click("#yes")
     page.until("watch.actions.driven === 0")
     page.page.keyboard.down("ArrowUp")
-    command = next_order(swarm)
+    command = swarm.next_order()
     page.page.keyboard.up("ArrowUp")
     assert command == {"do": "drive", "robot": 0, "ahead": 1, "left": 0}
 
@@ -226,14 +223,6 @@ class ForeignPage(BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""
-
-
-def next_order(swarm: WatchedSwarm) -> dict[str, Any]:
-    """What the page has ordered."""
-    try:
-        return swarm.commands.get(timeout=PATIENCE_S)
-    except queue.Empty:
-        pytest.fail("the page has ordered nothing")
 
 
 def wait_for(condition: Callable[[], bool], page: WatchedPage) -> None:

@@ -1,6 +1,5 @@
 """Hands on the page: fingers that move and pinch it, keys that drive a robot, and who is let in to do so."""
 
-import queue
 import socket
 from collections.abc import Iterator, Mapping
 
@@ -13,7 +12,6 @@ from bench.watch.watched_swarm import WatchedSwarm
 from swarm_loc_estimator.watch.server import Access
 
 Place = tuple[float, float]
-PATIENCE_S = 15.0
 
 
 class Fingers:
@@ -93,7 +91,7 @@ def test_a_finger_sets_a_pose(page: WatchedPage, fingers: Fingers, swarm: Watche
     fingers.move(f0=(u - 60, v))
     fingers.lift()
     page.page.click("#yes")
-    command = order_of(swarm)
+    command = swarm.next_order()
     assert (command["do"], command["robot"]) == ("set_pose", 1)
     assert command["pose"] == pytest.approx([0.1, 0.2, np.pi], abs=0.01)
 
@@ -105,15 +103,15 @@ def test_a_robot_stands_once_no_key_is_held(page: WatchedPage, swarm: WatchedSwa
     page.until("watch.actions.driven === 1")
     page.page.keyboard.down("w")
     page.page.keyboard.down("ArrowLeft")
-    while order_of(swarm) != {"do": "drive", "robot": 1, "ahead": 1, "left": 1}:
+    while swarm.next_order() != {"do": "drive", "robot": 1, "ahead": 1, "left": 1}:
         pass
     page.page.keyboard.up("w")
-    while order_of(swarm) != {"do": "drive", "robot": 1, "ahead": 0, "left": 1}:
+    while swarm.next_order() != {"do": "drive", "robot": 1, "ahead": 0, "left": 1}:
         pass
     page.page.keyboard.up("ArrowLeft")
     assert page.evaluate("watch.actions.keys.size") == 0
     page.page.keyboard.down("ArrowUp")
-    order_of(swarm)
+    swarm.next_order()
     page.page.keyboard.press("Escape")
     page.until("watch.actions.driven === -1")
     page.page.keyboard.up("ArrowUp")
@@ -167,7 +165,7 @@ def test_who_has_the_token_is_let_in_by_every_address(browser: Browser, guarded:
         page.until("watch.fitted && watch.painter.u")
         page.page.click("#reset")
         page.page.click("#yes")
-        assert order_of(guarded)["do"] == "reset"
+        assert guarded.next_order()["do"] == "reset"
         page.close()
         assert page.errors == page.foreign == []
 
@@ -181,11 +179,3 @@ def hosts() -> list[str]:
             return ["127.0.0.1"]
         other: str = one.getsockname()[0]
     return ["127.0.0.1", other]
-
-
-def order_of(swarm: WatchedSwarm) -> dict[str, object]:
-    """What the page has ordered next."""
-    try:
-        return swarm.commands.get(timeout=PATIENCE_S)
-    except queue.Empty:
-        pytest.fail("the page has ordered nothing")

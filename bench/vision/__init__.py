@@ -1,1 +1,1 @@
-"""The marker detector, compared with cv2.aruco and pupil-apriltags; `bench.epuck` runs it, too."""
+"""The marker detector, compared with cv2.aruco and pupil-apriltags."""

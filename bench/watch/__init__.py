@@ -1,1 +1,1 @@
-"""The page on which people watch a swarm: how fast, at what cost, and how it looks."""
+"""The page on which people watch a swarm: what its tests share, and its pictures."""

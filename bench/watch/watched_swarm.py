@@ -30,10 +30,11 @@ SWARM = Swarm(
 PLACES = np.array([[0.5, 0.25, 1.0], [-0.5, 0.5, -2.0], [0.0, -0.5, 0.0]])
 STATUS = (1, 1, 0)
 MAP_CORNER = (-1.5, -1.5, 0.3)
+_PATIENCE_S = 15.0
 
 
 class WatchedSwarm:
-    """Serves it; what pages order lies in `commands`.
+    """Serves it; what pages order lies in `commands`, see `next_order`.
 
     Args:
         port: 0 for any.
@@ -54,6 +55,13 @@ class WatchedSwarm:
     def _take(self, command: Command, answer: Answer) -> None:
         self.commands.put(dict(command))
         answer(f"done: {command['do']}")
+
+    def next_order(self) -> dict[str, Any]:
+        """What the page orders next."""
+        try:
+            return self.commands.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            raise AssertionError("the page has ordered nothing") from None
 
     def publish(
         self, poses: FloatArray = PLACES, later_ns: int = 100_000_000, status: Sequence[int] = STATUS

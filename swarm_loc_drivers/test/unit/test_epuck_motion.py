@@ -139,6 +139,12 @@ class Wheels:
         left, right = (as_counter(math.floor(s + 1e-6)) for s in self.steps)
         return self.odometry.update(self.now_ns, left, right)
 
+    def state(self) -> OdometryState:
+        """Report the counters, which tell where the robot is."""
+        state = self.read()
+        assert state is not None
+        return state
+
 
 @pytest.fixture
 def counts() -> Counter[str]:
@@ -158,8 +164,7 @@ def test_an_arc_is_an_arc_through_many_wraps_of_the_counters(
     wheels.command(1000.0, 800.0)
     for _ in range(4000):
         wheels.run(0.05)
-        state = wheels.read()
-    assert state is not None
+        state = wheels.state()
     paths = np.array([200e3, 160e3]) * GEOMETRY.metres_per_step
     turn = (paths[1] - paths[0]) / GEOMETRY.wheel_separation
     expected = se2.exp([paths.mean(), 0.0, turn])
@@ -178,8 +183,7 @@ def test_through_a_long_gap_the_robot_is_believed_to_have_obeyed(
     wheels.read()
     wheels.run(300.0)
     wheels.odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # said on reconnecting, just before the reading
-    state = wheels.read()
-    assert state is not None
+    state = wheels.state()
     assert state.pose[0] == pytest.approx(-800.0 * 300.1 * GEOMETRY.metres_per_step, abs=1e-3)
     assert not counts
 
@@ -191,8 +195,7 @@ def test_one_corrupt_reading_is_left_out(odometry: WheelOdometry, counts: Counte
     wheels.run(0.1)
     assert odometry.update(wheels.now_ns, 0x2828, 40) is None
     wheels.run(0.1)
-    state = wheels.read()
-    assert state is not None
+    state = wheels.state()
     assert state.pose == pytest.approx([80 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
     assert counts == {"implausible_counters": 1}
 
@@ -206,8 +209,7 @@ def test_a_robot_that_may_have_misunderstood_is_believed_by_its_counters(
     wheels.rates = np.array([-700.0, 20.0])  # by a command that was twisted on the way
     wheels.run(1.0)
     odometry.doubt_rates(wheels.now_ns - SECOND, EPUCK1.max_rate)
-    state = wheels.read()
-    assert state is not None
+    state = wheels.state()
     turn = 720 * GEOMETRY.metres_per_step / GEOMETRY.wheel_separation
     assert float(se2.wrap_angle(state.pose[2] - turn)) == pytest.approx(0.0, abs=1e-9)
     assert not counts
@@ -253,17 +255,14 @@ def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
     wheels.read()
     wheels.command(400.0, 400.0)
     wheels.run(1.0)
-    sure = wheels.read()
+    sure = wheels.state()
     wheels.run(0.5)
     wheels.steps = np.zeros(2)
     assert wheels.read() is None
     wheels.run(0.5)
-    lost = wheels.read()
+    lost = wheels.state()
     wheels.run(0.5)
-    after = wheels.read()
-    assert sure is not None
-    assert lost is not None
-    assert after is not None
+    after = wheels.state()
     assert lost.pose == pytest.approx(sure.pose)
     assert math.sqrt(lost.covariance[0, 0]) > 0.5 * 400 * GEOMETRY.metres_per_step
     assert after.pose[0] - lost.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
@@ -286,8 +285,7 @@ def test_a_step_of_the_clock_costs_no_way(
     for jump_s in (0.0, back_s, 0.0):
         wheels.run(0.05)
         wheels.now_ns -= round(jump_s * SECOND)
-        state = wheels.read()
-    assert state is not None
+        state = wheels.state()
     assert state.pose == pytest.approx([150 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
     assert counts == {"time_jumps": 1}
 
@@ -299,14 +297,11 @@ def test_counters_that_begin_anew_with_time_tell_no_way(
     wheels.read()
     wheels.command(400.0, 400.0)
     wheels.run(1.0)
-    before = wheels.read()
+    before = wheels.state()
     wheels.now_ns, wheels.steps = SECOND // 2, np.zeros(2)
-    jumped = wheels.read()
+    jumped = wheels.state()
     wheels.run(0.5)
-    after = wheels.read()
-    assert before is not None
-    assert jumped is not None
-    assert after is not None
+    after = wheels.state()
     assert jumped.pose == pytest.approx(before.pose)
     assert jumped.covariance[0, 0] > before.covariance[0, 0]
     assert after.pose[0] - jumped.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
@@ -317,14 +312,14 @@ def test_counters_that_begin_anew_with_time_tell_no_way(
 def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, float, int]]) -> None:
     odometry = WheelOdometry(GEOMETRY, NOISE, Counter())
     wheels = Wheels(odometry)
-    states = [wheels.read()]
+    states = [wheels.state()]
     for left, right, readings in legs:
         wheels.command(left, right)
         for _ in range(readings):
             wheels.run(0.05)
-            states.append(wheels.read())
-    poses = np.array([state.pose for state in states if state is not None])
-    stamps = np.array([state.stamp_ns for state in states if state is not None])
+            states.append(wheels.state())
+    poses = np.array([state.pose for state in states])
+    stamps = np.array([state.stamp_ns for state in states])
 
     model = OdometryModel(wheel_separation=GEOMETRY.wheel_separation, wheel_noise=NOISE, timeout_s=60.0)
     tracks = OdometryTracks([Robot("one", odometry=model)])
@@ -334,7 +329,6 @@ def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, 
     expected = jacobian @ covariance @ jacobian.T
 
     last = states[-1]
-    assert last is not None
     excess: NDArray[np.float64] = last.covariance - expected
     # chords against arcs, and the cut-off fraction of a step on top
     assert np.abs(excess).max() <= 0.02 * np.abs(expected).max() + 1e-5

@@ -12,6 +12,7 @@ from repository_bags import assert_same_messages, options_of, words_of
 from bench.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE
 from bench.scenarios.eight_run import CAMERA, EightSettings, simulate_eight, simulate_eight_images
 from bench.scenarios.generate_bag import main
+from bench.scenarios.lived_run import SimulatedRun
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
 from swarm_loc_drivers.sim.scenarios.eight import FAMILY
@@ -34,12 +35,19 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_description_is_that_of_the_run(bag: Path) -> None:
-    assert load_swarm(bag / "swarm.yaml") == simulate_eight(EightSettings(seed=3, duration_s=6.0)).swarm
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    """What the bag holds."""
+    return simulate_eight(EightSettings(seed=3, duration_s=6.0))
 
 
-def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(bag: Path) -> None:
-    run = simulate_eight(EightSettings(seed=3, duration_s=6.0))
+def test_the_description_is_that_of_the_run(bag: Path, run: SimulatedRun) -> None:
+    assert load_swarm(bag / "swarm.yaml") == run.swarm
+
+
+def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(
+    bag: Path, run: SimulatedRun
+) -> None:
     with BagReader(bag) as reader:
         assert {topic.name for topic in reader.topics} == {
             f"epuck{robot}/{topic}"
@@ -70,8 +78,7 @@ def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(bag: 
     np.testing.assert_allclose(images[0][1].detections["position"][:, 2], shown["value"][:, 0])
 
 
-def test_ground_truth_is_that_of_the_simulation(bag: Path) -> None:
-    run = simulate_eight(EightSettings(seed=3, duration_s=6.0))
+def test_ground_truth_is_that_of_the_simulation(bag: Path, run: SimulatedRun) -> None:
     with BagReader(bag) as reader:
         truth = [decode_pose_stamped(data) for _, _, _, data in reader.messages(["epuck5/ground_truth"])]
     assert len(truth) == 61

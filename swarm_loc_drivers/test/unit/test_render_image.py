@@ -575,15 +575,6 @@ def test_odometry_comes_at_its_rate_from_every_robot(rate_hz: float) -> None:
         np.testing.assert_array_equal(own["pose"][own["stamp_ns"] == run.start_ns][0], 0.0)
 
 
-def test_the_same_seed_gives_the_same_run_and_another_does_not() -> None:
-    one, same, other = (
-        simulate_eight(EightSettings(seed=seed, duration_s=5.0, errors=W2)) for seed in (7, 7, 8)
-    )
-    for name in ("odometry", "frames", "sightings"):
-        assert getattr(one, name).tobytes() == getattr(same, name).tobytes()
-        assert getattr(one, name).tobytes() != getattr(other, name).tobytes()
-
-
 def test_an_unknown_start_stays_out_of_the_description() -> None:
     settings = EightSettings(start_known=False)
     swarm = describe(settings, np.zeros((5, 3)))

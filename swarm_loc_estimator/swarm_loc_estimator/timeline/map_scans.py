@@ -46,7 +46,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings
 
-# The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
+# The constants of matching to a map are checked by `make bench-lidar`, part lidar_map.
 _WALL_M, _MIN_WINDOW = 0.12, 2
 """Half the side of the window in which the line of a wall is fitted [m], and at least this many cells."""
 _SURFACE = 1.5  # Depth in cells up to which occupied cells are the surface of a wall, and not its inside

@@ -20,15 +20,17 @@ from node_world import (
     Robots,
     Ros,
     detection_bytes,
+    is_estimated,
     newest_status,
     odometry_bytes,
     overrides,
+    report,
     sight,
     stamp_ns,
     values_of,
+    xytheta,
 )
 from node_world import SWARM_YAML as SWARM_YAML_LOCAL_FRAME_NODE
-from node_world import xytheta as xytheta_local_frame_node
 from rcl_interfaces.msg import Log
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
@@ -122,19 +124,9 @@ def droplets(ros: Ros, tmp_path: Path) -> Droplets:
     return droplets
 
 
-def report(heard: list[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
-    """The newest diagnostics of one name, and its values."""
-    status = newest_status(heard, name)
-    return status, values_of(status)
-
-
 def until_told(ros: Ros, heard: list[DiagnosticArray], now_ns: int) -> None:
     """Wait for diagnostics that are newer."""
     ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
-
-
-def xytheta(pose: SwarmPose) -> Any:
-    return np.array([pose.x, pose.y, pose.theta])
 
 
 def test_robots_without_odometry_are_located_by_light_and_by_fixes(ros: Ros, droplets: Droplets) -> None:
@@ -311,7 +303,7 @@ def test_poses_without_a_map_are_in_a_frame_of_a_robot_until_landmarks_come(
     ros.until(lambda: any(f"poses are relative to {frame[:-6]}, in '{frame}'" in one.msg for one in log))
     while robots.poses[-1].header.frame_id != "map":
         assert step((2, *LANDMARKS)) < T0_NS + 40 * SECOND
-    assert xytheta_local_frame_node(robots.newest("beta")) == pytest.approx(beta, abs=0.1)
+    assert xytheta(robots.newest("beta")) == pytest.approx(beta, abs=0.1)
     ros.until(lambda: any(f"poses are in 'map' now, no longer in '{frame}'" in one.msg for one in log))
 
 
@@ -328,11 +320,6 @@ anchors:
 """ + "".join(
     f"  - {{address: {a}, x: {x}, y: {y}, z: 1.0, range_bias_sigma: 0.0}}\n" for a, (x, y) in ANCHORS.items()
 )
-
-
-def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
-    """Whether an estimate at an instant has come after some."""
-    return any(stamp_ns(one) == now_ns for one in poses[before:])
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,11 @@ from node_world import (
     Robots,
     Ros,
     detection_bytes,
-    newest_status,
     odometry_bytes,
     overrides,
+    report,
     sight,
     stamp_ns,
-    values_of,
     xytheta,
 )
 from rcl_interfaces.msg import Log
@@ -50,12 +49,6 @@ def planar(pose: Any) -> np.ndarray[Any, Any]:
     place = getattr(pose, "position", None) or pose.translation
     turn = getattr(pose, "orientation", None) or pose.rotation
     return np.array([place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)])
-
-
-def report(heard: list[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
-    """The newest diagnostics of one name, and its values."""
-    status = newest_status(heard, name)
-    return status, values_of(status)
 
 
 def told_of(heard: list[DiagnosticArray], time_ns: int) -> Callable[[], bool]:

@@ -9,7 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped
 from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry
-from node_world import SECOND, T0_NS, Ros, odometry_bytes, overrides, stamp_ns
+from node_world import SECOND, T0_NS, Ros, is_estimated, odometry_bytes, overrides
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -58,11 +58,6 @@ def scan_at(now_ns: int) -> LaserScan:
     header = Header(stamp=Time(nanoseconds=now_ns).to_msg(), frame_id="alpha/base_scan")
     shape = {"angle_max": step * (BEAMS - 1), "angle_increment": step, "range_min": 0.1, "range_max": 8.0}
     return LaserScan(header=header, **shape, ranges=ranges)
-
-
-def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
-    """Whether an estimate at an instant has come after some."""
-    return any(stamp_ns(one) == now_ns for one in poses[before:])
 
 
 def stand_while_scans_come(

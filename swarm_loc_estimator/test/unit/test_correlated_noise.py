@@ -404,7 +404,6 @@ TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))
 FACES = (Face("left", 3, 0.01, 0.03, 0.0, 1.5, position_sigma=0.003), Face("back", 4, -0.03, yaw=3.1))
 SWARM = Swarm((SEER, Robot("other", faces=FACES)), (Landmark(7, 1.0, 0.2, 0.0, 3.0),))
-BELIEF = SwarmState(ParameterTable.of(SWARM.robots, SWARM.landmarks)).arrays()
 
 
 def with_time_sigma(swarm: Swarm, sigma_s: float) -> Swarm:

@@ -174,3 +174,23 @@ def test_an_image_without_detections_leaves_less_certain() -> None:
     none = chains.advanced(picture(np.zeros((0, 2))), point([0.5, 0, 0]), SECOND)
     assert none.probabilities.size == 0
     assert none.answer() is None
+
+
+def test_sure_answers_are_right_where_detections_are_missed_and_false() -> None:
+    """Any number of robots and images, with an error of the scale: at most 5 % of sure answers are wrong."""
+    rng, sure, right = np.random.default_rng(77), 0, 0
+    for _ in range(40):
+        robots, images, scale = int(rng.integers(2, 15)), int(rng.integers(3, 8)), rng.normal(1.0, 0.02)
+        seen, false = rng.uniform(0.85, 1.0), rng.choice([0.0, 0.3, 1.5])
+        truth, own = drive(rng, robots, images)
+        chains = Chains(ChainModel(scale=Scale(1.0, 0.02)))
+        for k in range(images):
+            order = rng.permutation(np.flatnonzero(rng.random(robots) < seen))
+            positions = scale * truth[k, order, :2] + SIGMA * rng.standard_normal((order.size, 2))
+            shown = np.vstack([positions, rng.uniform(-2.0, 2.0, (rng.poisson(false), 2))])
+            chains = chains.advanced(picture(shown), point(own[k, 0]), k * SECOND)
+            if k and chains.probabilities.max(initial=0.0) >= 0.99:
+                sure, place = sure + 1, int(np.argmax(chains.probabilities))
+                right += place < order.size and order[place] == 0
+    assert sure > 50
+    assert right >= 0.95 * sure

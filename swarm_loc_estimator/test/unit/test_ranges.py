@@ -35,7 +35,6 @@ from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, sav
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
-DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
 SIGMA = 0.02
 SQUARE = ((-1.5, -1.5, 0.8), (1.5, -1.5, 1.0), (1.5, 1.5, 0.8), (-1.5, 1.5, 1.0))
 LINE = ((-1.5, -1.5, 0.8), (0.0, -1.5, 0.8), (1.5, -1.5, 0.8))

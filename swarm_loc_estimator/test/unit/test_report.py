@@ -263,7 +263,7 @@ def figures_of(name: str, leds: dict[str, float]) -> MapFigures:
 
 def test_one_pushbot_makes_the_same_map_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag, files = BAGS / "pushbot_one", []
-    copy_part(bag, tmp_path / "bag", 90.0)
+    copy_part(bag, tmp_path / "bag", 45.0)
     beside = ["--swarm", str(bag / "swarm.yaml"), "--walls", str(bag / "walls.csv")]
     for name in ("a", "b"):
         out = tmp_path / name

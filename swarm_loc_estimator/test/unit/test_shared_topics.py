@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from core_messages import big_endian
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -60,13 +61,6 @@ def read(*messages: tuple[str, bytes]) -> Batch:
     rows = [(ingest.handle_of[topic], data, 10 + k) for k, (topic, data) in enumerate(messages)]
     (inputs,) = ingest.read(MessageBatch.of([SerializedMessage(*one) for one in rows]))
     return inputs
-
-
-def big_endian(data: bytes, message_type: str) -> bytes:
-    store = typestore()
-    return bytes(
-        store.serialize_cdr(store.deserialize_cdr(data, message_type), message_type, little_endian=False)
-    )
 
 
 @given(READINGS, st.sampled_from(["", "odom", "a_frame"]), st.booleans())
@@ -243,12 +237,6 @@ COVARIANCE = np.diag([1e-4, 4e-4, 1e-2])
 FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # added to that of each fix
 
 
-def big_endian_channels(data: bytes, message_type: str) -> bytes:
-    store = typestore()
-    message = store.deserialize_cdr(data, message_type)
-    return bytes(store.serialize_cdr(message, message_type, little_endian=False))
-
-
 def read_channels(*messages: tuple[str, bytes, int]) -> tuple[Batch, Ingest]:
     """Messages by topic and arrival."""
     ingest = Ingest(SWARM_CHANNELS)
@@ -273,7 +261,7 @@ def test_matrices_read_as_the_type_store_writes_them(
 ) -> None:
     readings = np.arange(n * n, dtype=np.int32).reshape(n, n) - 5
     data = encode_brightness(frame, stamp_ns, pair, readings, power, saturation)
-    one = BrightnessSensor.decode(big_endian_channels(data, BRIGHTNESS) if swapped else data)
+    one = BrightnessSensor.decode(big_endian(data, BRIGHTNESS) if swapped else data)
     assert (one.stamp_ns, one.frame_id, one.receiver, one.transmitter) == (stamp_ns, frame, *pair)
     assert (one.n, one.power, one.saturation) == (n, power, saturation)
     assert one.readings.dtype == np.int32
@@ -285,7 +273,7 @@ def test_fixes_read_as_the_type_store_writes_them(
     frame: str, stamp_ns: int, yaw: float, swapped: bool
 ) -> None:
     data = encode_fix(frame, stamp_ns, (1.0, -2.0, yaw), COVARIANCE)
-    one = decode_fix(big_endian_channels(data, POSE_WITH_COVARIANCE) if swapped else data)
+    one = decode_fix(big_endian(data, POSE_WITH_COVARIANCE) if swapped else data)
     assert (one.stamp_ns, one.frame_id) == (stamp_ns, frame)
     assert one.pose == pytest.approx((1.0, -2.0, yaw))
     np.testing.assert_array_equal(one.covariance, COVARIANCE)

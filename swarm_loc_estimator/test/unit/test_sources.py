@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from core_messages import big_endian
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
@@ -134,13 +134,6 @@ def detections(frame: str, stamp_ns: int, count: int) -> bytes:
     rows["position"] = np.arange(3 * count).reshape(-1, 3)
     rows["alternative_ratio"] = 0.5
     return encode_detections(frame, stamp_ns, rows)
-
-
-def big_endian(data: bytes, message_type: str) -> bytes:
-    """The same message in the other byte order."""
-    store = typestore()
-    message = store.deserialize_cdr(data, message_type)
-    return bytes(store.serialize_cdr(message, message_type, little_endian=False))
 
 
 def batch_of(

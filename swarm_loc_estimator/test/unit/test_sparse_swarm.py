@@ -18,7 +18,6 @@ from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
-DENSE = replace(SPARSE, sparse_from=1000)
 
 world_of = lru_cache(maxsize=16)(simulate)  # For tests that change nothing in it
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETECTION_DTYPE
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
@@ -20,6 +21,13 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 SECOND = 10**9
 T0 = 1_000 * SECOND
 POSITION, POSE, POSE_TWO = 1, 2, 3
+
+
+def big_endian(data: bytes, message_type: str) -> bytes:
+    """The same message in the other byte order."""
+    store = typestore()
+    message = store.deserialize_cdr(data, message_type)
+    return bytes(store.serialize_cdr(message, message_type, little_endian=False))
 
 
 def detection(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[np.void]:

@@ -29,7 +29,6 @@ SECOND = 10**9
 T0 = 1_000 * SECOND
 DROPLET = load_ir_platform("droplet")
 REACH_M = 0.28
-SLOT_NS = 2 * SECOND // 5  # One robot after the other lights its emitters; both powers take so long
 FIX_SIGMA = np.array([0.002, 0.002, 0.02])
 WALK = OdometryModel(
     wheel_noise=0.0,

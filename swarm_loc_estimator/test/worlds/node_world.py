@@ -306,6 +306,17 @@ def values_of(status: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
+def report(heard: Sequence[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
+    """The newest diagnostics of one name, and its values."""
+    status = newest_status(heard, name)
+    return status, values_of(status)
+
+
+def is_estimated(poses: Sequence[SwarmPoses], before: int, now_ns: int) -> bool:
+    """Whether an estimate at an instant has come after some."""
+    return any(stamp_ns(one) == now_ns for one in poses[before:])
+
+
 class Program:
     """An executable as a process of its own, its output in one file.
 

@@ -123,7 +123,7 @@ def laser_calibration(parameters: EventTrackerParameters) -> LaserCalibration | 
 
 
 _LONG_AGO_NS = -(1 << 62)
-# Checked, with the defaults of `TrackerSettings`, by `make bench-pushbot ARGS="--parts tracker"`.
+# Checked, with the defaults of `TrackerSettings`, by test_event_tracker.py; figures: event_tracker_node.md.
 _ITERATIONS = 8
 _MAX_SHIFT_PX, _SETTLED_PX = 3.0, 1e-3
 _PIXEL_VARIANCE = 1.0 / 12.0  # Variance of a place within its pixel [px^2]

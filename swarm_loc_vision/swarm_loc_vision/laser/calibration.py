@@ -133,7 +133,7 @@ _MIN_SPREAD = 2.0
 """Least ratio of the largest to the smallest depth; with less, f b and p_inf cannot be separated."""
 _MAX_RESIDUAL_PX = 1.0
 _START_PX = 0.1
-# The prior of the bias: checked by test_laser.py and `make bench-pushbot ARGS="--parts calibration"`.
+# The prior of the bias: checked by test_laser.py; figures: calibrate_laser.md.
 _BEND_PX = 0.05  # Prior standard deviation of a knot off the line between its neighbours [px]
 _SIZE_PX = 0.3  # Prior standard deviation of a knot [px]
 _LEAST_SAMPLES = 4

@@ -44,7 +44,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5  # Index of the first knot from which curves must decrease
-# Weights and limits are checked by test_ir_boards.py and, on recordings of 2016, by make bench-droplet_real.
+# Weights and limits are checked by test_ir_boards.py; on recordings of 2016: `a084869b:bench/droplet/real`.
 _STEEPNESS, _BEND = 5.0, 0.8
 """Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)

@@ -43,7 +43,7 @@ from swarm_loc_estimator.infrared.search import DARKEST
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01  # Probability of a false alarm for any element: that it is dead, or that it saturates
-# Dead elements: checked by test_ir_boards.py and, on recordings of 2016, by make bench-droplet_real.
+# Dead elements: checked by test_ir_boards.py; on recordings of 2016: `a084869b:bench/droplet/real`.
 _DEAD_SHARES = (0.0, 0.15, 0.35)  # Shares of its light that a dead or shaded element gives
 _BRIGHT = 10.0
 """Minimum of the brightest reading of a usable exchange [sigma]; below, robots are out of range or sight."""

@@ -25,6 +25,7 @@ from bench.pushbot.lidar import (
     NAME,
     NEAREST,
     ODOMETRY_STEPS,
+    SWEEP_S,
     SWEEP_STEPS,
     LidarBody,
     LidarDrive,
@@ -40,9 +41,11 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.messages import decode_scan
+from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.lidar import ScanRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
@@ -51,7 +54,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 CELL = 0.05
 MAP_SIGMAS = {"exact": 0.02, "drawn": 0.05}
 BLOCKED = 0.25
-_ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
+ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
 _START = StartSigma(0.05, 0.05, math.radians(3.0))
 _PEOPLE, _NEAR_M, _FAR_M = 3, 0.4, 1.5
 _EVALUATE_FROM_S, _RUN_S, _MAP_MINUTES = 2.0, 60.0, 5.0
@@ -138,6 +141,30 @@ def drawn_map(plan: FloorPlan, minutes: float, seed: int) -> OccupancyMap:
     return drive.mapper.occupancy()
 
 
+def sweep(begin_ns: int, ranges: FloatArray, far_m: float) -> ScanMessage:
+    """The scan of a sweep that began at a time, with ranges (BEAMS,) up to `far_m` [m]."""
+    turn = 2.0 * math.pi / BEAMS
+    return ScanMessage(begin_ns, 0.0, 2.0 * math.pi, turn, SWEEP_S / BEAMS, NEAREST, far_m, ranges)
+
+
+def inputs_of_sweeps(
+    now_ns: int, odometry: Sequence[tuple[int, int, FloatArray]], ranges: Sequence[FloatArray], far_m: float
+) -> Batch:
+    """Odometry (robot, stamp, pose) since the last sweeps, and these sweeps, one of each robot or none."""
+    robots, stamps = (np.array([one[k] for one in odometry]) for k in (0, 1))
+    poses = np.array([pose for _, _, pose in odometry])
+    rows: dict[str, Any] = {
+        "odometry": OdometryRows(robots, stamps, poses, np.full_like(poses, np.nan), stamps)
+    }
+    begin_ns = now_ns - round(SWEEP_S * 1e9)
+    if ranges:
+        scans = np.empty(len(ranges), dtype=object)
+        scans[:] = [sweep(begin_ns, one, far_m) for one in ranges]
+        at_ns, end_ns = np.full((2, len(ranges)), [[begin_ns], [now_ns]])
+        rows["scans"] = ScanRows(np.arange(len(ranges)), at_ns, scans, end_ns)
+    return Batch.of(begin_ns, now_ns, **rows)
+
+
 def block(ranges: FloatArray, share: float, rng: np.random.Generator, time_s: float) -> FloatArray:
     """Ranges (BEAMS,) with a share of them at people around the robot, who walk."""
     width = round(share * BEAMS / _PEOPLE)
@@ -179,7 +206,7 @@ def record(
     said = pose + rng.standard_normal(3) * [_START.x, _START.y, _START.theta] + start_shift
     start: Pose2 = (float(said[0]), float(said[1]), float(said[2]))
     lidar = replace(LIDAR, map_sigma=map_sigma)
-    robot = Robot(NAME, start=start, start_sigma=_START, lidar=lidar, odometry=_ODOMETRY)
+    robot = Robot(NAME, start=start, start_sigma=_START, lidar=lidar, odometry=ODOMETRY)
     # its odometry, and a scan at the end of each sweep
     odometry, scans, arrivals_ns = [], [], []
     steps = round(until_s / PERIOD_S)
