@@ -20,6 +20,7 @@ BENCHMARKS = {
     "robots": "bench.robots",
     "robustness": "bench.robustness",
     "scaling": "bench.peers.scaling",
+    "start": "bench.start",
     "vision": "bench.vision",
 }
 """Name -> module."""
