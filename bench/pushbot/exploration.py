@@ -42,6 +42,7 @@ class PushBotNoise:
     dropout: float = 0.01  # Share of readings without reflection
     outlier: float = 0.003  # Share of readings that are outliers
     bearing: float = math.radians(1.0)  # Of the bearing of a light [rad]
+    held: float = 0.0  # Share of drives in which something holds the body while its wheels turn on
 
 
 class KinematicPushBot:
@@ -111,8 +112,12 @@ class KinematicPushBot:
         discs = self._discs(others, count)
         free = _free_steps(self._plan.walls, discs, self.pose, poses)
         self.bumps += free < count
-        poses = poses[: max(free, 1)] if free else self.pose[None]
         ahead = np.array([math.cos(self._odometry[2]), math.sin(self._odometry[2]), 0.0])
+        if self._noise.held and self._rng.random() < self._noise.held:  # half of them from the beginning
+            moves = min(free, int(self._rng.uniform(-count, count)))
+            poses = np.vstack([self.pose, poses])[np.clip(np.arange(1, count + 1), 0, max(0, moves))]
+            free = count
+        poses = poses[: max(free, 1)] if free else self.pose[None]
         reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)
         return self._moved(poses, reported, others)
 

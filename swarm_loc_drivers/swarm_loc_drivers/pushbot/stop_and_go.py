@@ -28,6 +28,9 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
 _BLIND_DRIVE = 0.4  # Way of a lost robot that gets no goal, ahead or to where it is farthest [m]
+_HELD_WAY, _MAX_SHRINK, _MIN_READINGS = 0.05, 0.15, 10
+"""A body is held if over this way of its wheels [m], which grows with the squared distance as noise does, the
+distance ahead shrinks by less than this share; and minimum number of distances on that way."""
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
 """Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
@@ -91,12 +94,16 @@ class StopAndGo:
         self._fixed: tuple[float, float] | None = None
         self._is_near = False
         self._distances: deque[float] = deque(maxlen=3)
+        # Path by odometry since the drive began [m], and distance ahead [m]
+        self._ahead: deque[tuple[float, float]] = deque(maxlen=200)
         self._farthest = self._open_heading = 0.0
 
     def take_distance(self, distance: float) -> None:
         """Take a distance of the laser [m]; NaN: no detection."""
         self._is_near = distance < self._settings.clearance
         self._distances.append(distance)
+        if self._track and self._anchor is not None and math.isfinite(distance):
+            self._ahead.append((math.dist(self._track[-1][1:3], self._anchor[:2]), distance))
         if self._track and (least := min(self._distances)) > self._farthest:  # one may be an outlier
             self._farthest, self._open_heading = least, self._track[-1][3]
 
@@ -141,6 +148,7 @@ class StopAndGo:
         while self._moves:
             if self._anchor is None:
                 self._anchor = now
+                self._ahead.clear()
             velocity = self._towards(self._moves[0], now, self._anchor)
             if velocity is not None:
                 return velocity
@@ -174,11 +182,21 @@ class StopAndGo:
         self._track.append((stamp_ns, x, y, theta))
         return np.array([x, y, theta])
 
+    def _is_held(self) -> bool:
+        """Whether an obstacle that the laser does not meet holds the body, whose wheels turn on."""
+        way, distance = np.array(self._ahead).reshape(-1, 2).T
+        needed = _HELD_WAY * (1.0 + distance[-1] ** 2) if len(way) else math.inf
+        newest = way > way[-1:] - needed
+        if newest.all() or newest.sum() < _MIN_READINGS:
+            return False
+        before, after = np.array_split(distance[newest], 2)
+        return bool(abs(np.median(before) - np.median(after)) < _MAX_SHRINK * needed)
+
     def _towards(self, move: _Turn | _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
         """Velocity of a move at a pose (3,) by odometry; None when the move is done."""
         if isinstance(move, _Drive):
             left = move.length - math.dist(now[:2], begin[:2])
-            if left >= _ARRIVED and not self._is_near:
+            if left >= _ARRIVED and not self._is_near and not self._is_held():
                 speed = min(max(_GAIN * left, _MIN_SPEED), self._settings.speed)
                 return speed, 0.0, _COURSE_GAIN * float(begin[2] - now[2])
             self.halts += left >= _ARRIVED

@@ -141,6 +141,20 @@ def test_something_ahead_ends_a_drive_and_it_looks_around_there() -> None:
     assert robot.motion.halts == 1
 
 
+@pytest.mark.parametrize("distance", [0.6, 1.5])
+def test_a_body_that_is_held_ends_a_drive(distance: float) -> None:
+    """It touches the edge of an obstacle beside its laser; then what is ahead comes no nearer."""
+    robot, rng = looked_around(), np.random.default_rng(3)
+    pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])
+    robot.motion.take_goal(MapGoal(robot.now_ns, pose, pose[:2] + np.array([1.0, 0.0])))
+    while (way := math.dist(robot.pose[:2], pose[:2])) < 0.95 and not robot.motion.halts:
+        robot.step()
+        left = distance + max(0.0, 0.3 - way)
+        robot.motion.take_distance(left + 0.016 * left**2 * rng.standard_normal())
+    assert robot.motion.halts == 1
+    assert math.dist(robot.pose[:2], pose[:2]) - 0.3 < 0.06 + 0.09 * distance**2
+
+
 def test_nothing_seen_ahead_is_no_obstacle() -> None:
     robot = looked_around()
     robot.motion.take_distance(math.nan)

@@ -12,7 +12,14 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, wrap_angle
-from swarm_loc_estimator.mapping.matching import Lattice, accumulate, agreement, search_offsets
+from swarm_loc_estimator.mapping.matching import (
+    SEARCH_BEAMS,
+    Lattice,
+    accumulate,
+    agreement,
+    score,
+    search_offsets,
+)
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import LightSightings, ScanStop
 
@@ -31,6 +38,36 @@ _START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
 """Radius [m], maximum number of targets (a first scan has ten parts), and minimum score of a start search."""
 _MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
 """Maximum shift of a start pose: standard deviations, and in addition [m, rad]."""
+
+
+_HELD_STEP, _HELD_TARGETS, _MIN_HELD_SCORE, _MAX_END = 0.04, 6, 0.5, 0.85
+"""Drives of a body that is held: step of the search along them [m], number of stops near each end that are
+compared, minimum score of the place where it is, and maximum score near the end relative to it."""
+
+
+def driven_share(graph: PoseGraph, left: FloatArray, stop: int) -> float:
+    """The share of a drive by odometry from a place (2,) that a robot has moved, by its scan at a new stop.
+
+    An obstacle may hold a body whose wheels turn on. Then its scan fits at an earlier place of the drive, and
+    clearly worse at its end. The stop is moved to where it fits.
+    """
+    place = graph.states[stop, :2]
+    arrival, against = place.copy(), dict[int, None]()
+    for end in (left, arrival):
+        place[:] = end
+        nearest = np.argsort(graph.distances(stop), kind="stable")[: _HELD_TARGETS + 1].tolist()
+        against |= dict.fromkeys(one for one in nearest if one != stop)
+    others, count = np.array(list(against)), math.ceil(math.dist(left, arrival) / _HELD_STEP)
+    stride = max(1, int(graph.scans.beams.counts[stop]) // SEARCH_BEAMS)
+    scores = np.zeros(count + 1)
+    for step in range(count + 1):
+        place[:] = arrival - (1.0 - step / max(1, count)) * (arrival - left)
+        scores[step] = score(graph.scans, stop, others, stride)
+    best = int(scores.argmax())
+    is_held = scores[best] > _MIN_HELD_SCORE and scores[-3:].max() < _MAX_END * scores[best]
+    share = best / count if is_held else 1.0
+    place[:] = arrival - (1.0 - share) * (arrival - left)
+    return share
 
 
 def align(graph: PoseGraph, stop: int, path: float) -> bool:

@@ -27,6 +27,7 @@ from swarm_loc_estimator.mapping.localization import (
     align_all,
     align_start,
     close_loop,
+    driven_share,
     find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
@@ -117,7 +118,7 @@ class CooperativeMapper:
         self.visits = VisitationMap()
         self.sweeps = SweepMap(self.graph)
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
-        self.counters |= {"scans_not_located": 0, "places_taken_back": 0}
+        self.counters |= {"drives_held": 0, "scans_not_located": 0, "places_taken_back": 0}
         self.counters |= {"loops_taken_back": 0, "odometry_contradicted": 0}
         self._tracks: dict[int, Track] = {}
         self._lights = LightBook()
@@ -421,23 +422,39 @@ class CooperativeMapper:
             fits = self._enter_first(robot, track, stop, count)
             self._check_place(robot, track, stop, fits=fits)
             return
-        motion = between(track.left, stop.arrival)
-        sigma = self._motion_sigma(track.path, abs(float(motion[2])))
-        pose = self._driven(track, stop.arrival)
-        begin = track.node
+        # Add it where odometry has it, or in place of the last one where the graph is full.
+        graph, begin, pose = self.graph, track.node, self._driven(track, stop.arrival)
+        motion, left = between(track.left, stop.arrival), graph.states[begin, :2].copy()
+        known = np.diag(graph.covariance(begin)) if track.passes else np.zeros(3)
         if track.passes:
-            node = self._replace(track.node, pose, sigma, stop)
+            node = begin
+            self._lights.forget_node(node)
+            graph.reuse_stop(node, pose, stop.sigma)
         else:
-            node = self.graph.add_stop(robot, pose, stop.sigma)
-            self.graph.constraints.departures.add(begin, node, self.graph.turned[begin], motion, sigma)
+            node = graph.add_stop(robot, pose, stop.sigma)
         self.begin_ns[node] = int(stop.stamp_ns[0])
-        self.graph.set_scan(node, stop.scan(0, count))
-        track.node, track.passes = node, self.graph.count > self.settings.max_stops
-        if node != begin and not find_slip(self.graph, begin, node):
+        graph.set_scan(node, stop.scan(0, count))
+        # Believe odometry as far as the scan does.
+        share = driven_share(graph, left, node)
+        sigma = self._motion_sigma(track.path, abs(float(motion[2])))
+        sigma[0] += (1.0 - share) * track.path
+        if share < 1.0:
+            self.counters["drives_held"] += 1
+            motion[:2] *= share
+        if track.passes:
+            drive = np.array([*np.full(2, sigma[:2].max()), sigma[2]])
+            graph.constraints.priors.add(
+                node, node, graph.states[node, :3], np.hypot(np.sqrt(np.maximum(known, 0.0)), drive)
+            )
+        else:
+            graph.constraints.departures.add(begin, node, graph.turned[begin], motion, sigma)
+        # Align it, and close loops.
+        track.node, track.passes = node, graph.count > self.settings.max_stops
+        if node != begin and not find_slip(graph, begin, node):
             return
-        if not align(self.graph, node, track.path):
+        if not align(graph, node, track.path):
             self.counters["scans_refused"] += 1
-        if close_loop(self.graph, node):
+        if close_loop(graph, node):
             self.counters["loops_closed"] += 1
         self._check_place(robot, track, stop)
 
@@ -475,15 +492,6 @@ class CooperativeMapper:
         self.counters["loops_taken_back"] = self.sweeps.taken_back
         self.counters["odometry_contradicted"] = len(self.sweeps.contradicted)
         self._check_place(robot, track, sweep)
-
-    def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
-        """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""
-        known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
-        self._lights.forget_node(node)
-        self.graph.reuse_stop(node, pose, stop.sigma)
-        drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
-        self.graph.constraints.priors.add(node, node, pose, np.hypot(known, drive))
-        return node
 
     def _motion_sigma(self, path: float, turn: float) -> FloatArray:
         """Standard deviations (3,) of a drive: along [m], across [m], heading [rad]."""

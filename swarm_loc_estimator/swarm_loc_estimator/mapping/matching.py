@@ -207,7 +207,7 @@ def _remove_direction(H: FloatArray, g: FloatArray, angle: float) -> None:
 
 
 _APART_M = 0.2  # Minimum distance of another place from the best one
-_BEAMS = 60  # Number of beams of a stop used by the search
+SEARCH_BEAMS = 60  # Number of beams of a stop used by the search
 
 
 class Lattice(NamedTuple):
@@ -232,7 +232,7 @@ def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: La
     cells = 2 * int(lattice.reach / lattice.step) + 1
     scores = np.zeros((2 * int(lattice.turn_reach / lattice.turn_step) + 1, cells, cells))
     for k in parts:
-        stride = max(3, int(scans.beams.counts[k]) // _BEAMS)
+        stride = max(3, int(scans.beams.counts[k]) // SEARCH_BEAMS)
         scores += _scores(scans, int(k), int(parts[0]), against, lattice, stride)
     best = np.unravel_index(int(scores.argmax()), scores.shape)
     half = (np.array(scores.shape) - 1) // 2
@@ -262,13 +262,13 @@ def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattic
                 states[k, 0] = centre_x + cos * arm_x - sin * arm_y + b * lattice.step
                 states[k, 1] = centre_y + sin * arm_x + cos * arm_y + c * lattice.step
                 states[k, 2] = before[2] + turn
-                scores[a + turns, b + cells, c + cells] = _score(scans, k, against, stride)
+                scores[a + turns, b + cells, c + cells] = score(scans, k, against, stride)
     states[k] = before
     return scores
 
 
 @cached_njit
-def _score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
+def score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
     """The share of every `stride`-th beam of a stop that fits any of the others, minus its loss."""
     good, tried = 0.0, 0
     for i in range(0, scans.beams.counts[k], stride):

@@ -33,6 +33,8 @@ _APART = np.array([0.15, math.radians(8.0)])
 _STEP, _TURN_STEP = 0.1, math.radians(3.0)  # Of the places that are tried first [m], [rad]
 _FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
 """Of the places around these, and of those after each drive [m, rad], and their number to each side."""
+_HELD_STEP, _HELD_COST = 0.15, 0.1
+"""Of places along a drive where an obstacle may have held a robot whose wheels turned on: step [m], cost."""
 _STEP_COST = 0.002  # What a squared step costs: where the map tells little, odometry is followed
 _HYPOTHESES = 100  # Maximum number of places
 _RULED_OUT, _OVERTAKEN = 0.5, 0.15
@@ -64,7 +66,8 @@ class Search:
     poses: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3)))  # (h, k, 3)
     fits: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) share of beams that fit
     known: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) of which the map tells
-    lit: FloatArray = field(default_factory=lambda: np.zeros(0))  # (h,) number of lights that fit
+    # (h,) number of lights that fit, less half a scan for each drive in which something held the robot
+    lit: FloatArray = field(default_factory=lambda: np.zeros(0))
     stops: list[ScanStop] = field(default_factory=list)  # (k,)
     since: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) motion since the last arrival
     left: FloatArray | None = None  # (3,) odometry then
@@ -82,7 +85,7 @@ class Search:
 
         Returns whether its scan is a whole one; of others only the motion is used.
         """
-        away = self._move(stop, ratio)
+        self._move(stop, ratio)
         self.left = stop.arrival if stop.reach else stop.departure
         turned = 0.0 if stop.reach else ratio * float(stop.turn[-1])
         is_whole = stop.reach > 0.0 or stop.turned > 2.0 * math.pi
@@ -92,11 +95,14 @@ class Search:
                 self.stops = []
                 self._begin(view, occupancy)
             else:
-                predicted = compose(self.poses[:, -1], self.since)
-                if away < _NEW_PLACE:  # the same place: its newest scan counts
-                    self.poses, self.fits = self.poses[:, :-1], self.fits[:, :-1]
-                    self.known, self.stops = self.known[:, :-1], self.stops[:-1]
-                self._append(view, predicted)
+                before, predicted = self.poses[:, -1], compose(self.poses[:, -1], self.since)
+                self._append(view, predicted, (predicted - before)[:, :2])
+                best = self.poses[int(self._totals().argmax())]
+                if (
+                    math.dist(best[-1, :2], best[-2, :2]) < _NEW_PLACE
+                ):  # the same place: its newest scan counts
+                    self.poses, self.fits = np.delete(self.poses, -2, 1), np.delete(self.fits, -2, 1)
+                    self.known, self.stops = np.delete(self.known, -2, 1), self.stops[:-1]
             self.stops.append(stop)
             self.since = np.zeros(3)
             self._thin()
@@ -136,14 +142,13 @@ class Search:
         totals: FloatArray = (self.fits + _UNKNOWN * (1.0 - self.known)).sum(axis=1) + self.lit
         return totals
 
-    def _move(self, stop: ScanStop, ratio: float) -> float:
-        """Add the drive to a stop; its distance from the last one [m]."""
+    def _move(self, stop: ScanStop, ratio: float) -> None:
+        """Add the drive to a stop."""
         x, y, turn = between(stop.arrival if self.left is None else self.left, stop.arrival)
         length, course = math.hypot(x, y), ratio * math.atan2(y, x)
         motion = [length * math.cos(course), length * math.sin(course), ratio * turn]
         self.since = compose(self.since, motion)
         self.path += length
-        return math.hypot(self.since[0], self.since[1])
 
     def _begin(self, view: _View, occupancy: OccupancyMap) -> None:
         """Try all places that the robot may have reached unheard."""
@@ -163,12 +168,24 @@ class Search:
             poses = poses[_apart(poses[0], poses)]
         self.poses, self.fits, self.known = np.zeros((len(chosen), 0, 3)), *np.zeros((2, len(chosen), 0))
         self.lit = np.zeros(len(chosen))
-        self._append(view, np.array(chosen).reshape(-1, 3))
+        self._append(view, np.array(chosen).reshape(-1, 3), np.zeros((len(chosen), 2)))
 
-    def _append(self, view: _View, predicted: FloatArray) -> None:
-        """Align hypotheses (h, 3) with the map, and note how well they fit."""
-        cells = np.column_stack([view.cells(predicted[:, :2]), predicted[:, 2]])
-        aligned = _align(view.score, view.walls, cells, _FINE / view.cell)
+    def _append(self, view: _View, predicted: FloatArray, way: FloatArray) -> None:
+        """Align hypotheses (h, 3) with the map, and note how well they fit.
+
+        An obstacle may have held the robot anywhere on its way (h, 2) there, while its wheels turned on.
+        """
+        count = math.ceil(np.hypot(*way.T).max(initial=0.0) / _HELD_STEP)
+        best, aligned = np.full(len(predicted), -math.inf), np.zeros_like(predicted)
+        steps = np.zeros(len(predicted))
+        for step in range(count + 1):
+            places = predicted[:, :2] - step / max(1, count) * way
+            cells = np.column_stack([view.cells(places), predicted[:, 2]])
+            there, scores = _align(view.score, view.walls, cells, _FINE / view.cell)
+            scores -= _HELD_COST if step else 0.0
+            is_better = scores > best
+            aligned[is_better], best[is_better], steps[is_better] = there[is_better], scores[is_better], step
+        self.lit -= _RULED_OUT * (steps > 0)
         poses = np.column_stack([view.places(aligned[:, :2]), aligned[:, 2]])
         fits, known = _compare(view.score, view.occupied, view.ends, view.hits, aligned, _NEAREST / view.cell)
         self.poses = np.concatenate([self.poses, poses[:, None]], axis=1)
@@ -277,21 +294,23 @@ def _score_places(
 
 
 @cached_njit
-def _align(score: FloatArray, walls: FloatArray, poses: FloatArray, step: float) -> FloatArray:
-    """The poses (h, 3) [cells, rad] near others (h, 3) at which points of walls fit best."""
+def _align(
+    score: FloatArray, walls: FloatArray, poses: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray]:
+    """The poses (h, 3) [cells, rad] near others (h, 3) at which walls' points fit best, and how well (h,)."""
     aligned: FloatArray = poses.copy()
+    best = np.full(len(poses), -1.0)
     for h in range(len(poses)):
-        best = -1.0
         for a in range(-_FINE_STEPS, _FINE_STEPS + 1):
             for b in range(-_FINE_STEPS, _FINE_STEPS + 1):
                 for c in range(-_FINE_STEPS, _FINE_STEPS + 1):
                     x, y = poses[h, 0] + a * step, poses[h, 1] + b * step
                     heading = poses[h, 2] + c * _FINE_TURN
                     value = _mean_score(score, walls, x, y, heading) - _STEP_COST * (a * a + b * b + c * c)
-                    if value > best:
-                        best = value
+                    if value > best[h]:
+                        best[h] = value
                         aligned[h] = x, y, heading
-    return aligned
+    return aligned, best
 
 
 @cached_njit

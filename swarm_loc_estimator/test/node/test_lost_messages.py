@@ -92,6 +92,18 @@ def test_a_publisher_that_ends_beside_another_has_lost_nothing(ros: Ros, inputs:
     assert not inputs.drops
 
 
+def test_what_is_lost_after_one_of_two_publishers_has_ended_is_counted(ros: Ros, inputs: Inputs) -> None:
+    (ending, old), (_, new) = inputs.publisher(), inputs.publisher()
+    inputs.send(old, 90)
+    inputs.send(new, 5)
+    assert inputs.take_all() == 95
+    ending.destroy_publisher(old)
+    ros.until(lambda: inputs.node.count_publishers(TOPIC) == 1)
+    inputs.send(new, DEPTH + 70)
+    assert inputs.take_all() == DEPTH
+    assert inputs.drops == {"overload": 70}
+
+
 @pytest.mark.parametrize("others", [(), (9,), (2, 90)])
 def test_what_a_full_queue_loses_is_counted_beside_other_publishers_too(
     inputs: Inputs, others: tuple[int, ...]

@@ -192,6 +192,45 @@ def test_a_robot_that_moves_unheard_while_its_driver_restarts_is_found_by_its_sc
     assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
 
 
+@pytest.mark.parametrize("moves", [0.0, 0.5])
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_a_robot_whose_wheels_turn_while_something_holds_it_is_where_its_scan_says(
+    moves: float, seed: int
+) -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(seed))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    while distance_in_room(*robot.pose) < 1.0:
+        feed(mapper, 0, [robot.turn(0.5)])
+    for _ in range(2):
+        before = robot.pose[:2].copy()
+        feed(mapper, 0, [robot.drive(0.7, moves), robot.turn(SCAN_TURN)])
+        assert math.dist(before, robot.pose[:2]) == pytest.approx(moves * 0.7)
+        position, heading = error_of(mapper, 0, robot)
+        assert position < 0.03
+        assert heading < math.radians(2.0)
+    assert mapper.counters["drives_held"] == 2
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_a_lost_robot_that_something_holds_has_looked_from_one_place_only(seed: int) -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(seed))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    restart(robot, 2.1, 0.0)
+    feed(mapper, 0, look_around(robot))
+    while distance_in_room(*robot.pose) < 0.6:
+        feed(mapper, 0, [robot.turn(1.0)])
+    arrival = np.append(robot.pose[:2], 0.0)
+    feed(mapper, 0, [robot.drive(0.4, 0.0)])
+    arrival[2] = robot.pose[2]
+    feed(mapper, 0, [robot.turn(SCAN_TURN), robot.rest(1.2)])
+    search = mapper._tracks[0].search
+    assert search is not None
+    assert search.poses.shape[1] == 1
+    off = search.poses[:, -1] - arrival
+    is_aligned = np.abs(wrap_angle(off[:, 2])) < math.radians(5.0)
+    assert (is_aligned & (np.hypot(off[:, 0], off[:, 1]) < 0.03)).any()
+
+
 def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     mapper, robot = CooperativeMapper(), RoomRobot((*MIDDLE, 0.3), 0.0, np.random.default_rng(22))
     robot.has_niche = False

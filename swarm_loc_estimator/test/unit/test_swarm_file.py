@@ -238,6 +238,7 @@ def test_names_that_topics_and_frames_have_are_refused(tmp_path: Path, name: str
         ("fileversion: !!python/name:os.system x", "tag"),
         (f"fileversion: 1\nrobots: {{a: {{start: {{x: {'9' * 400}, y: 0, theta: 0}}}}}}", "must lie in"),
         (f"fileversion: 1\nrobots: {{{'a' * 65}: }}", "must have at most 64 characters"),
+        ("fileversion: 1\nrobots: {a: {}, A: {}}", "which must differ by more than capitals"),
         (
             "fileversion: 1\nrobots:\n" + "".join(f"  a{k}:\n" for k in range(5001)),
             "robots names 5001 robots but must name at most 5000",

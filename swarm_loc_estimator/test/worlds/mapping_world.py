@@ -94,13 +94,14 @@ class RoomRobot:
         """Let time pass without readings until that of another robot, or that one's until ours."""
         self._stamp_ns = other._stamp_ns = max(self._stamp_ns, other._stamp_ns)
 
-    def drive(self, length: float) -> Readings:
-        """Drive ahead [m]."""
+    def drive(self, length: float, moves: float = 1.0) -> Readings:
+        """Drive ahead by a length of the odometry [m]; the body moves the first share of it, and is held."""
         count = max(1, round(length / (_SPEED * PERIOD_NS * 1e-9)))
         way = length * np.arange(1, count + 1)[:, None] / count
         odometry = np.tile(self.odometry, (count, 1))
         odometry[:, :2] += way * [math.cos(self.odometry[2]), math.sin(self.odometry[2])]
-        places = self.pose[:2] + way * [math.cos(self.pose[2]), math.sin(self.pose[2])]
+        moved = np.minimum(way, moves * length)
+        places = self.pose[:2] + moved * [math.cos(self.pose[2]), math.sin(self.pose[2])]
         readings = self._read(odometry, places, np.full(count, self.pose[2]))
         self.pose[:2] = places[-1]
         return readings
