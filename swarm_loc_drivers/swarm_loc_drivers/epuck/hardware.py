@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.common.robot_driver import Session
 from swarm_loc_estimator.common.arrays import FloatArray
 
 STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
@@ -169,13 +167,3 @@ class CameraImage:
 
     stamp_ns: int  # Best estimate of the exposure time [ns]
     pixels: Image  # (height, width, 3) RGB
-
-
-class EpuckSession(Session, Protocol):
-    """A conversation with one e-puck."""
-
-    found: list[Reading | CameraImage]  # Measurements; the reader empties the list
-    is_idle: bool  # Whether no answer is pending: the next step sends a request
-
-    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """See `TalkSession.step`."""

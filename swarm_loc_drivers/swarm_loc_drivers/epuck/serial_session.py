@@ -139,7 +139,7 @@ _NS = 1_000_000_000
 
 
 class SerialSession(TalkSession):
-    """Requests readings at every step that finds it idle, and images in between; see `EpuckSession`.
+    """Requests readings at every step that finds it idle, and images in between; a `Session`.
 
     `doubt` is called when it is unknown which commands the robot has received. Counts `exchanges`,
     `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
@@ -149,8 +149,8 @@ class SerialSession(TalkSession):
         self, params: EpuckParameters, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
     ) -> None:
         super().__init__(counts)
-        self.is_idle = False
-        self.found: list[Reading | CameraImage] = []
+        self.is_idle = False  # Whether no answer is pending: the next step sends a request
+        self.found: list[Reading | CameraImage] = []  # Measurements; the reader empties the list
         self._params = params
         self._wanted_speeds = speeds
         self._doubt = doubt

@@ -141,12 +141,8 @@ class EventRing:
 
 def _fixed(words: NDArray[np.uint16], times: NDArray[np.int64], stamp_bytes: int) -> bytes:
     """Events with timestamps of one length, the most significant byte first."""
-    table = np.empty((len(words), 2 + stamp_bytes), np.uint8)
-    table[:, 0] = words >> 8 | 0x80
-    table[:, 1] = words & 0xFF
-    for k in range(stamp_bytes):
-        table[:, 2 + k] = times >> 8 * (stamp_bytes - 1 - k) & 0xFF
-    return table.tobytes()
+    stamps = times[:, None] >> 8 * np.arange(stamp_bytes)[::-1] & 0xFF
+    return np.column_stack([words >> 8 | 0x80, words & 0xFF, stamps]).astype(np.uint8).tobytes()
 
 
 def _differences(words: NDArray[np.uint16], deltas: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
