@@ -136,7 +136,13 @@ def _plan_of_map(path: Path) -> FloorPlan:
         UserError: The map cannot be used.
     """
     grid = load_map(path)
-    walls = grid.cell * _boundaries(grid.occupied) + np.tile(grid.corner, 2)
+    # lines (S, 4) between solid and free cells of the grid (nx, ny), in cells; all around it is solid
+    padded = np.pad(grid.occupied, 1, constant_values=True)
+    x, low, high = _runs(padded[1:] != padded[:-1]).T
+    y, left, right = _runs((padded[:, 1:] != padded[:, :-1]).T).T
+    upright = np.column_stack([x, low - 1, x, high - 1])
+    level = np.column_stack([left - 1, y, right - 1, y])
+    walls = grid.cell * np.vstack([upright, level]).astype(float) + np.tile(grid.corner, 2)
     return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), TreeChecks(path, FloorPlanError))
 
 
@@ -151,16 +157,6 @@ def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
     if not 0 < len(walls) <= _MAX_WALLS:
         raise checks.said(f"the plan has {len(walls)} walls but must have 1 to {_MAX_WALLS}")
     return replace(plan, walls=walls)
-
-
-def _boundaries(solid: BoolArray) -> FloatArray:
-    """Lines (S, 4) between solid and free cells of a grid (nx, ny), in cells; all around it is solid."""
-    padded = np.pad(solid, 1, constant_values=True)
-    x, low, high = _runs(padded[1:] != padded[:-1]).T
-    y, left, right = _runs((padded[:, 1:] != padded[:, :-1]).T).T
-    upright = np.column_stack([x, low - 1, x, high - 1])
-    level = np.column_stack([left - 1, y, right - 1, y])
-    return np.vstack([upright, level]).astype(float)
 
 
 def _runs(rows: BoolArray) -> NDArray[np.int64]:

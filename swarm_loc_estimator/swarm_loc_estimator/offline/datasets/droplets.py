@@ -196,23 +196,7 @@ class CleanTruth:
 def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
     """Find the poses of all robots at each exchange."""
     remarks = Counter[str]()
-    owned: dict[int, list[Place]] = {}
-    for place in find_places(exchanges):
-        if len(place.seen) < 2:
-            remarks["sightings of robots on the move or seen once dropped"] += len(place.seen)
-        else:
-            owned.setdefault(place.owner, []).append(place)
-    poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
-    stand = 0
-    for owner, places in owned.items():
-        for place in _without_overlaps(places, remarks):
-            stand += 1
-            _write(place, owner, stand, poses, remarks)
-    return CleanTruth(poses, remarks)
-
-
-def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
-    """All places in the order of their first sightings."""
+    # all places in the order of their first sightings
     places, open_places = list[Place](), list[Place]()
     for moment, exchange in enumerate(exchanges):
         open_places = [
@@ -230,7 +214,20 @@ def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
                 open_places.append(nearest)
             nearest.add(moment, sighting)
             taken.add(id(nearest))
-    return places
+    # the places of each robot, and its poses there
+    owned: dict[int, list[Place]] = {}
+    for place in places:
+        if len(place.seen) < 2:
+            remarks["sightings of robots on the move or seen once dropped"] += len(place.seen)
+        else:
+            owned.setdefault(place.owner, []).append(place)
+    poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
+    stand = 0
+    for owner, places in owned.items():
+        for place in _without_overlaps(places, remarks):
+            stand += 1
+            _write(place, owner, stand, poses, remarks)
+    return CleanTruth(poses, remarks)
 
 
 def _without_overlaps(places: list[Place], remarks: Counter[str]) -> list[Place]:

@@ -382,22 +382,7 @@ def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> Stre
     """Sightings of one stamp as one message, late by the delay."""
     name = f"robot{robot.subject}"
     stamp_ns, first = np.unique(robot.sighting_ns, return_index=True)
-    rows = _detection_rows(robot)
-    bounds = [*first.tolist(), len(rows)]
-    frame = f"{name}/camera_optical_frame"
-    data = [
-        encode_detections(frame, stamp, rows[begin:end])
-        for stamp, begin, end in zip(stamp_ns.tolist(), bounds, bounds[1:], strict=False)
-    ]
-    late_ns = rng.integers(delay.low_ns, delay.high_ns, len(stamp_ns), endpoint=True)
-    order = np.argsort(stamp_ns + late_ns, kind="stable")
-    return Stream(
-        f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
-    )
-
-
-def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
-    """(M,) sightings as detections: a position in the optical frame (x right, z forward), heading unknown."""
+    # (M,) sightings as detections: a position in the optical frame (x right, z forward), heading unknown
     rows = np.zeros(len(robot.barcode), DETECTION_DTYPE)
     distance, bearing = robot.sighting.T
     rows["id"] = robot.barcode
@@ -409,7 +394,17 @@ def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
     rows["position"][:, 2] = distance * np.cos(bearing)
     rows["orientation"][:, 3] = rows["alternative_orientation"][:, 3] = 1.0
     rows["covariance"] = UNKNOWN_COVARIANCE
-    return rows
+    # messages in the order of their arrival
+    bounds, frame = [*first.tolist(), len(rows)], f"{name}/camera_optical_frame"
+    data = [
+        encode_detections(frame, stamp, rows[begin:end])
+        for stamp, begin, end in zip(stamp_ns.tolist(), bounds, bounds[1:], strict=False)
+    ]
+    late_ns = rng.integers(delay.low_ns, delay.high_ns, len(stamp_ns), endpoint=True)
+    order = np.argsort(stamp_ns + late_ns, kind="stable")
+    return Stream(
+        f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
+    )
 
 
 def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> Stream:

@@ -92,7 +92,19 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardModel
     The platform defines arrangement, saturation and initial noise. Gains of sensors with enough exchanges are
     estimated, too.
     """
-    noise = round(noise_floor(data), 2)
+    # robust standard deviation of dark readings [count], by the differences of one element's in successive
+    # exchanges of a receiver, so that offset and drift of the amplifier cancel
+    middle = float(np.nanmedian(data.readings))
+    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    steps = []
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
+        dark = np.abs(own - middle) < limit
+        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
+    found = np.concatenate(steps)
+    noise = round(float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5, 2)
+    # curves, law, gains and yaw with this noise, then the noise that is relative to readings
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
     unknowns = _Problem(platform, data, robots).first_unknowns()
     for _ in range(_ROUNDS):
@@ -116,24 +128,6 @@ def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatAr
     moved[:, 1] = wrap_angle(poses[:, 1] - receiver_yaw)
     moved[:, 2] = wrap_angle(poses[:, 2] + transmitter_yaw - receiver_yaw)
     return moved
-
-
-def noise_floor(data: BoardReadings) -> float:
-    """Robust standard deviation of dark readings [count].
-
-    It is computed from differences of one element's dark readings in successive exchanges of a receiver, so
-    offset and drift of the amplifier cancel.
-    """
-    middle = float(np.nanmedian(data.readings))
-    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
-    steps = []
-    for receiver in np.unique(data.receiver).tolist():
-        rows = np.flatnonzero(data.receiver == receiver)
-        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
-        dark = np.abs(own - middle) < limit
-        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
-    found = np.concatenate(steps)
-    return float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
 
 
 class _Problem:
@@ -386,19 +380,14 @@ def _clear(
             places[k] = interpolate(recording.truth[robot.name], data.stamp_ns, _TRUTH_GAP_NS)[0][:, :2]
     rows, of_swarm = np.arange(len(data.stamp_ns)), np.array(robots)
     begin, end = (places[of_swarm[side], rows] for side in (data.receiver, data.transmitter))
-    clear = np.ones(len(rows), dtype=np.bool_)
+    way, clear = end - begin, np.ones(len(rows), dtype=np.bool_)
     for k, others in enumerate(places):
-        away = _distance_to_line(others, begin, end)
+        # distance (k,) of this robot from the lines of sight
+        share = np.sum((others - begin) * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12)
+        away = np.linalg.norm(others - begin - np.clip(share, 0.0, 1.0)[:, None] * way, axis=1)
         third = (of_swarm[data.receiver] != k) & (of_swarm[data.transmitter] != k)
         clear &= ~(third & (away < width))
     return clear
-
-
-def _distance_to_line(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Distances (k,) from points to line segments; all arguments (k, 2)."""
-    way = end - begin
-    share = np.sum((points - begin) * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12)
-    return np.asarray(np.linalg.norm(points - begin - np.clip(share, 0.0, 1.0)[:, None] * way, axis=1))
 
 
 GAIN_SIGMA = 0.05
@@ -489,7 +478,11 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
     platform = replace(model.platform, stray_noise=stray, covariance_scale=scale)
     held = replace(held, nees=held.nees / scale)
     brightest = np.nanmax(np.nan_to_num(data.readings), axis=(0, 2))
-    sigma = stock_residual(start, alive)
+    # RMS residual of unsaturated readings of the initial platform at the true poses [sigma]
+    bright = expected_brightness(replace(start, amplitudes=start.amplitudes[:1]), alive.poses)[:, 0]
+    usable = (alive.readings < start.saturation) & (bright < start.saturation)  # False for NaN
+    off = (alive.readings - bright) / np.hypot(start.noise, start.relative * bright)
+    sigma = float(np.sqrt(np.mean(off[usable] ** 2))) if usable.any() else np.inf
     return BoardCalibration(replace(model, platform=platform), sigma, held, gains, elements, brightest)
 
 
@@ -515,14 +508,6 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
     errors = solutions.poses[found] - truth[found]
     errors[:, 1:] = wrap_angle(errors[:, 1:])
     return HeldOut(errors, nees(errors, solutions.covariances[found]), len(found))
-
-
-def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
-    """RMS residual of unsaturated readings at the true poses [sigma]."""
-    bright = expected_brightness(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
-    usable = (data.readings < platform.saturation) & (bright < platform.saturation)  # False for NaN
-    off = (data.readings - bright) / np.hypot(platform.noise, platform.relative * bright)
-    return float(np.sqrt(np.mean(off[usable] ** 2))) if usable.any() else np.inf
 
 
 def without_dead(

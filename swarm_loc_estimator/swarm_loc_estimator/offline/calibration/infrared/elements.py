@@ -326,13 +326,6 @@ def _same_readings(readings: FloatArray, k: int, others: list[int]) -> BoolArray
     return same
 
 
-def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
-    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
-    _, number = np.unique(pairs, axis=1, return_inverse=True)
-    in_order = np.argsort(number.ravel(), kind="stable")
-    return np.split(in_order, np.flatnonzero(np.diff(number.ravel()[in_order])) + 1)
-
-
 def _tops(exchanges: Exchanges) -> tuple[FloatArray, NDArray[np.int64]]:
     """Brightest reading (k, n) of each sensor in each exchange, and the index of its emitter."""
     readings = np.nan_to_num(exchanges.readings[:, 0], nan=-np.inf)
@@ -360,7 +353,10 @@ def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
 
 def _repeats(exchanges: Exchanges, saturation: FloatArray) -> _Repeats:
     """All pairs of consecutive exchanges, without readings near described or estimated saturation."""
-    rows = _rows_of_pairs(exchanges)
+    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
+    _, number = np.unique(pairs, axis=1, return_inverse=True)
+    in_order = np.argsort(number.ravel(), kind="stable")
+    rows = np.split(in_order, np.flatnonzero(np.diff(number.ravel()[in_order])) + 1)
     one, other = (np.concatenate([part[s] for part in rows]) for s in (slice(None, -1), slice(1, None)))
     first, second = exchanges.readings[one, 0], exchanges.readings[other, 0]
     receiver, level = exchanges.receiver[one], 0.5 * (first + second)

@@ -69,20 +69,8 @@ def helpful_gains(
         except GainsError:
             continue
         logs[held] = held_out_likelihoods(platform, fit.gains, select(exchanges, held))
-    return _chosen_robots(np.stack([exchanges.receiver, exchanges.transmitter]), logs, blocks, robots)
-
-
-def _chosen_robots(
-    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], robots: int
-) -> BoolArray:
-    """Remove the robot with the least improvement until each remaining one and their sum pass the test.
-
-    Args:
-        pairs: (2, k) receivers and transmitters.
-        logs: (k, H, H) log likelihoods by the hypotheses on both.
-        blocks: (k,) index of the block of time.
-        robots: Number of robots.
-    """
+    # remove the robot with the least improvement until each remaining one and their sum pass the test
+    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
     helps = np.ones(robots, dtype=np.bool_)
     while helps.any():
         own = np.full(robots, np.inf)
