@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
 
@@ -158,7 +158,7 @@ class Reading:
     doubt_ns: int  # Uncertainty of the stamp in both directions [ns]
     left_counter: int  # Steps of the left wheel, 16 bits, wrapping
     right_counter: int  # Steps of the right wheel, 16 bits, wrapping
-    proximity: NDArray[np.int64]  # (8,) raw values of ps0..ps7
+    proximity: IntArray  # (8,) raw values of ps0..ps7
 
 
 @dataclass(frozen=True)

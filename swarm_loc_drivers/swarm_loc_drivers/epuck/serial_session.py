@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.robot_driver import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
 from swarm_loc_drivers.epuck.hardware import (
@@ -29,6 +28,7 @@ from swarm_loc_drivers.epuck.hardware import (
     decode_rgb565,
 )
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_estimator.common.arrays import IntArray
 
 END = 0
 RGB565_MODE = 1
@@ -92,7 +92,7 @@ def _request(left: int, right: int, letters: str, size: int) -> Request:
     return Request(queries, _SPEEDS.pack(left, right), size)
 
 
-def decode_readings(body: bytes) -> tuple[int, int, NDArray[np.int64]]:
+def decode_readings(body: bytes) -> tuple[int, int, IntArray]:
     """Counters of the left and the right wheel, 16 bits, and raw values (8,) of ps0..ps7."""
     left, right, *proximity = _READINGS.unpack(body)
     return left, right, np.array(proximity, np.int64)

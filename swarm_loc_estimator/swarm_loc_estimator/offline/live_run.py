@@ -19,7 +19,6 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from domain_coordinator import domain_id
-from numpy.typing import NDArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -27,7 +26,7 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launch import (
     Child,
@@ -278,7 +277,7 @@ class LiveRun:
     result: ReplayResult  # Poses as received, ground truth of the bag, counts of dropped inputs
     # Topic of the estimator's inputs -> (M,) increasing log times of its messages in the bag, all of which
     # were published
-    arrival_ns: Mapping[str, NDArray[np.int64]]
+    arrival_ns: Mapping[str, IntArray]
     # Stamp of poses -> topic -> messages that the estimator had received by then; of some poses
     taken: Mapping[int, Mapping[str, int]]
     rate: float  # Speed of the player
@@ -309,7 +308,7 @@ class BagContent:
     begin_ns: int  # First log time
     end_ns: int  # Last one
     # Topic of the estimator's inputs -> (M,) increasing log times of its messages
-    arrival_ns: Mapping[str, NDArray[np.int64]]
+    arrival_ns: Mapping[str, IntArray]
     truth: Mapping[str, Trajectory]  # Robot name -> ground truth
     remarks: tuple[str, ...]  # What could not be read, one sentence each
 

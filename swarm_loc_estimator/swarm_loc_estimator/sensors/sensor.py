@@ -456,7 +456,7 @@ class SharedColumns(NamedTuple):
     """Decoded messages (n,) with readings of many robots."""
 
     stamp_ns: IntArray  # (n,) stamps of the messages
-    valid: NDArray[np.bool_]  # (n,) True if the message is complete and of the right type
+    valid: BoolArray  # (n,) True if the message is complete and of the right type
     rows: Any  # The readings
     dropped: Mapping[str, int]  # Number of unusable readings of valid messages by reason
 

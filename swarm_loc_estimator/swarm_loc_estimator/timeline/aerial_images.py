@@ -168,7 +168,7 @@ class PictureFusion:
         self,
         state: SwarmState,
         image: Measurements,
-        looking: np.typing.NDArray[np.bool_],
+        looking: np.typing.BoolArray,
         claims: dict[int, Identity],
         taken: Counter[int],
     ) -> None:

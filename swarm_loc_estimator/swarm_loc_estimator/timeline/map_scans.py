@@ -126,7 +126,7 @@ def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
 
 
 @cached_njit
-def _lines(surface: NDArray[np.bool_], cells: IntArray, window: int) -> tuple[FloatArray, FloatArray]:
+def _lines(surface: BoolArray, cells: IntArray, window: int) -> tuple[FloatArray, FloatArray]:
     """Lines (w, 4) at wall cells (w, 2) and variances (w,) of their normals, in units of cells."""
     line, normal_variance = np.zeros((len(cells), 4)), np.zeros(len(cells))
     for k in range(len(cells)):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import SWARM_SIGHTINGS, CdrError, decode, encode, nanoseconds
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
 
@@ -18,7 +19,7 @@ class Recent(NamedTuple):
 
     measurements: Measurements  # (m,) sorted by stamp
     verdicts: NDArray[np.uint8]  # (m,) of `Verdict`
-    nis: NDArray[np.float64]  # (m,) normalized innovation squared
+    nis: FloatArray  # (m,) normalized innovation squared
 
 
 class Sightings(NamedTuple):

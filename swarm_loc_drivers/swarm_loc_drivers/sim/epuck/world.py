@@ -29,7 +29,7 @@ from swarm_loc_drivers.sim.worlds import (
     hidden_geometry,
     start_of,
 )
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -151,7 +151,7 @@ class EpuckWorld:
         rng = self._random(_SENSOR, exposure.robot, exposure.number)
         return self.rig.take(exposure.robot, exposure.middle_ns, track, rng)
 
-    def proximity(self, robot: int) -> NDArray[np.int64]:
+    def proximity(self, robot: int) -> IntArray:
         """Raw values (8,) of a robot's proximity sensors now."""
         rng = self._random(_PROXIMITY, robot, self.now_ns)
         return proximity_values(self.poses, robot, self._settings.arena.size, rng)
@@ -210,7 +210,7 @@ class SimulatedEpuck:
         left, right = self._world.steps[self._robot].tolist()
         return int(left), int(right)
 
-    def proximity(self) -> NDArray[np.int64]:
+    def proximity(self) -> IntArray:
         """Raw values, ps0..ps7 clockwise from the front."""
         return self._world.proximity(self._robot)
 

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator import load_map
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError
@@ -159,7 +158,7 @@ def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
     return replace(plan, walls=walls)
 
 
-def _runs(rows: BoolArray) -> NDArray[np.int64]:
+def _runs(rows: BoolArray) -> IntArray:
     """Row, begin and end (R, 3) of the runs of True in each row (n, m)."""
     flips = np.diff(np.pad(rows, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, begin = np.nonzero(flips > 0)

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from swarm_loc_estimator.common import se2
@@ -54,7 +53,7 @@ class RobotLog:
     twist: FloatArray  # (N, 2) commanded forward speed [m/s] and turn rate [rad/s]
     sighting_ns: IntArray  # (M,) stamps, not decreasing
     sighting: FloatArray  # (M, 2) range [m] and bearing [rad, positive to the left]
-    barcode: npt.NDArray[np.int64]  # (M,) of each sighting
+    barcode: IntArray  # (M,) of each sighting
     truth: Trajectory | None  # Ground truth in map; None when there is none
 
 
@@ -148,7 +147,7 @@ def _barcode_remark(subject: int, noted: Mapping[int, int], used: Mapping[int, i
 def _seen_places(dataset: Dataset) -> dict[int, FloatArray]:
     """Barcode -> (K, 2) positions in map, from sightings by robots with a known pose."""
     found: list[FloatArray] = []
-    names: list[npt.NDArray[np.int64]] = []
+    names: list[IntArray] = []
     for robot in dataset.robots:
         if robot.truth is None:
             continue

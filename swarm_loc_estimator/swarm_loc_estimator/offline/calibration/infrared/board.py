@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.filter.measurements import select
@@ -66,11 +65,11 @@ _MAX_EVALUATIONS = 10
 class BoardReadings(NamedTuple):
     """Exchanges of robots with one kind of board at full power."""
 
-    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
-    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    receiver: IntArray  # (k,) index of the robot that measured
+    transmitter: IntArray  # (k,) index of the robot that lit its emitters
     readings: FloatArray  # (k, n, n) [count], [sensor, emitter], NaN where not measured or dead
     poses: FloatArray  # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]
-    stamp_ns: NDArray[np.int64]  # (k,)
+    stamp_ns: IntArray  # (k,)
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class BoardModel:
     platform: IrPlatform  # The board
     sensor_gains: FloatArray  # (robots, n) gains of the receivers' sensors; 1 where not estimated
     # (robots,) True where estimated; their spread is the platform's `element_sigma`
-    gains_sought: NDArray[np.bool_]
+    gains_sought: BoolArray
     truth_yaw: FloatArray  # (robots,) heading of each robot minus that of its ground truth [rad]
     scatter: FloatArray  # (k, n, n) residuals of the fitted readings [sigma]
     angles: FloatArray  # (2, k, n, n) angles of the paths at sensors and emitters [rad]
@@ -135,7 +134,7 @@ class _Problem:
 
     def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int) -> None:
         self._platform, self._data, self._robots = platform, data, robots
-        self.gains_sought: NDArray[np.bool_] = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
+        self.gains_sought: BoolArray = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
         self._often = np.flatnonzero(self.gains_sought)
         count = len(_KNOTS)
         flat = ((1, np.zeros(count)), (1, np.zeros(count)))
@@ -540,7 +539,7 @@ def _cross_validated(
     return {one: _joined(found) for one, found in parts.items()}
 
 
-def _blocks(data: BoardReadings) -> NDArray[np.int64]:
+def _blocks(data: BoardReadings) -> IntArray:
     """Block of time (k,) of each exchange; blocks divide the exchanges of each receiver evenly."""
     blocks = np.zeros(len(data.receiver), dtype=np.int64)
     for receiver in np.unique(data.receiver).tolist():

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -87,7 +86,7 @@ def helpful_gains(
 
 
 def _by_block(
-    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], helps: BoolArray, judged: BoolArray
+    pairs: IntArray, logs: FloatArray, blocks: IntArray, helps: BoolArray, judged: BoolArray
 ) -> list[FloatArray]:
     """Log-likelihood ratios by block of the estimated gains to each other hypothesis."""
     receiver, transmitter = np.where(helps, GAINS, UNKNOWN)[pairs]
