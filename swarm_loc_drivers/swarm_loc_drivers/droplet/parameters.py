@@ -39,8 +39,7 @@ class DropletTraits(DriverParameters):
 class DropletParameters(DropletTraits):
     """Parameters of `droplet_driver_node`.
 
-    Raises:
-        ParameterError: A parameter is invalid, or conflicts with another one.
+    Raises ParameterError if a parameter is invalid, or conflicts with another one.
     """
 
     address: str = text("", "the serial port of the Droplet at the cable", required=True)

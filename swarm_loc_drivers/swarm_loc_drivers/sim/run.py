@@ -35,8 +35,7 @@ class Trajectories:
     def all_at(self, stamp_ns: IntArray) -> FloatArray:
         """The poses (M, N, 3) of all robots at stamps (M,).
 
-        Raises:
-            ValueError: A stamp lies outside the simulated time.
+        Raises ValueError if a stamp lies outside the simulated time.
         """
         index, share = self._locate(stamp_ns)
         return _interpolate(self.poses[index], self.poses[index + 1], share[:, None])

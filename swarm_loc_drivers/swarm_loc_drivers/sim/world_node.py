@@ -58,11 +58,8 @@ class WorldNode(ConfiguredNode[Parameters]):
         """Put all robots on their links.
 
         `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a folder of links,
-        else a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first
-        one; 0: any.
-
-        Raises:
-            ParameterError: A link cannot be made.
+        else a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first one;
+        0: any. Raises ParameterError if a link cannot be made.
         """
         for robot, name in enumerate(names):
             firmware = firmware_of(robot)

@@ -115,11 +115,7 @@ class LinkedWorldParameters(WorldParameters):
 
 
 def start_of(robot: Robot) -> Pose2:
-    """The start pose of a robot.
-
-    Raises:
-        WorldError: The swarm description has none.
-    """
+    """The start pose of a robot; raises WorldError if the swarm description has none."""
     if robot.start is None:
         raise WorldError(f"robot '{robot.name}' has no start pose, and a simulated robot needs one.")
     return robot.start

@@ -73,10 +73,8 @@ def estimate_gains(
 ) -> GainsFit:
     """Estimate the gains of all robots; `element_sigma` of the platform is their prior standard deviation.
 
-    `progress` is called with the name of each step.
-
-    Raises:
-        GainsError: `element_sigma` is 0, the platform's curves do not hold, or no exchange can be used.
+    `progress` is called with the name of each step. Raises GainsError if `element_sigma` is 0, the platform's
+    curves do not hold, or no exchange can be used.
     """
     if platform.element_sigma == 0.0:
         raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")

@@ -79,8 +79,7 @@ def checked(
 ) -> tuple[FloatArray, PairGains, FloatArray]:
     """Validate readings (k, modes, n, n), gains and saturation (k, modes), and fill in defaults.
 
-    Raises:
-        ReadingsError: They have another shape.
+    Raises ReadingsError if they have another shape.
     """
     values = np.ascontiguousarray(readings, dtype=np.float64)
     wanted = (len(platform.amplitudes), platform.n, platform.n)

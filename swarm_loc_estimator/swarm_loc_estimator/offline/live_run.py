@@ -64,10 +64,8 @@ class LiveError(UserError):
 class LiveGraph:
     """A graph that runs as child processes while this process listens; use it as a context manager.
 
-    The estimator is the first node; the others start when this process has discovered its poses.
-
-    Raises:
-        LiveError: The estimator does not start.
+    The estimator is the first node; the others start when this process has discovered its poses. Raises
+    LiveError if the estimator does not start.
     """
 
     recorder: Recorder  # Records poses and diagnostics
@@ -123,10 +121,8 @@ class LiveGraph:
         """Process messages until a condition holds, which is checked after each event and every 50 ms.
 
         `what` is the condition in words, following "did not". The patience is since the last poses. All nodes
-        that have started, or those that are needed, must keep running.
-
-        Raises:
-            LiveError: A node has ended, or the timeout has passed.
+        that have started, or those that are needed, must keep running. Raises LiveError if a node has ended,
+        or the timeout has passed.
         """
         heard, since_s = -1, time.monotonic()
         while not condition():
@@ -317,11 +313,7 @@ Watch = Callable[[Recorder, BagContent], None]
 
 
 def read_content(bag: Path, swarm: Swarm) -> BagContent:
-    """Read ground truth and arrival times of a bag.
-
-    Raises:
-        BagError: Nothing in the bag can be read.
-    """
+    """Read ground truth and arrival times of a bag; raises BagError if nothing in the bag can be read."""
     inputs = [topic.name for topic in input_topics(swarm)]
     with BagReader(bag) as reader:
         truth = TruthReader(swarm, reader.topics)

@@ -48,10 +48,8 @@ def replay_map(
 
     The bag has `<robot>/odom`, `<robot>/laser` and, if frequencies of LEDs by robot [Hz] are given,
     `<robot>/lights`; of robots with a lidar `<robot>/scan`. `progress` is called now and then with the share
-    done and what is being done. `remap` is as in `renamed_topics`.
-
-    Raises:
-        UserError: The bag cannot be read, a topic cannot be mapped, or the robots cannot start.
+    done and what is being done. `remap` is as in `renamed_topics`. Raises UserError if the bag cannot be
+    read, a topic cannot be mapped, or the robots cannot start.
     """
     source = {
         f"{robot.name}/{kind.topic}": (k, kind)

@@ -271,10 +271,8 @@ def read_bag(
     """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
     `take` is called with the inputs, in order of arrival, less those that `loss` drops; ground truth, maps
-    and goals are complete. `remap` is as in `renamed_topics`.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    and goals are complete. `remap` is as in `renamed_topics`. Raises BagError if nothing in the bag can be
+    read, or a topic cannot be mapped.
     """
     ingest, maps = Ingest(swarm), MapReader(swarm)
     network = Network(loss, [*ingest.handle_of])
@@ -323,10 +321,8 @@ def mounts_of_bag(
 ) -> Mounts:
     """Mounts of sensors by the static transforms of a bag; `remap` as in `renamed_topics`.
 
-    `heard` are topics that may be mapped beside those of the estimator.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    `heard` are topics that may be mapped beside those of the estimator. Raises BagError if nothing in the bag
+    can be read, or a topic cannot be mapped.
     """
     mounts = Mounts(swarm)
     known = [*Ingest(swarm).handle_of, *truth_topics(swarm), *MapReader(swarm).topics, *heard]
@@ -357,10 +353,8 @@ def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str
     """Topic of a bag -> the topic as which it is read, by rules expected topic -> topic of the bag.
 
     An example is robot1/odom -> /robot1/odometry/filtered; `<robot>` in both stands for each robot. `known`
-    are the expected topics.
-
-    Raises:
-        BagError: An expected topic is unknown, or two of them have the same topic of the bag.
+    are the expected topics. Raises BagError if an expected topic is unknown, or two of them have the same
+    topic of the bag.
     """
     renamed: dict[str, str] = {}
     for own, stored in remap.items():

@@ -111,10 +111,8 @@ class InputTopic:
 def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm.
 
-    With `maps` also those that are of use to a mapper, or in a map that is not described.
-
-    Raises:
-        UserError: `Swarm.topics` has a topic that is not read, or two topics are the same.
+    With `maps` also those that are of use to a mapper, or in a map that is not described. Raises UserError if
+    `Swarm.topics` has a topic that is not read, or two topics are the same.
     """
     known = {kind.topic for kind in kinds().values() if kind.of_each} | {TRUTH}
     if unknown := [key for key in swarm.topics if key.partition("/")[2] not in known]:
@@ -208,10 +206,8 @@ class Batch:
         """Create a batch from columns by sensor, see `Estimator.step`.
 
         Nothing arrives before `begin_ns`; readings without `arrival_ns` arrive at their stamps, but not after
-        `now_ns`.
-
-        Raises:
-            TypeError: There is no such sensor, robot or column, or a column has another length or shape.
+        `now_ns`. Raises TypeError if there is no such sensor, robot or column, or a column has another length
+        or shape.
         """
         rows = {}
         for name, given in readings.items():

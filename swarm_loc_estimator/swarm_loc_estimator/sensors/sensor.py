@@ -42,8 +42,7 @@ def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
 def fill(column: NDArray[Any], given: Any, name: str) -> None:
     """Write given values to a column (k, ...); a number stands for all.
 
-    Raises:
-        TypeError: They have another length or shape, or are no numbers that the column can hold.
+    Raises TypeError if they have another length or shape, or are no numbers that the column can hold.
     """
     try:
         if column.dtype == object:

@@ -105,8 +105,7 @@ class Match(NamedTuple):
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
     """Prepare a map for matching; its file is for errors.
 
-    Raises:
-        MapFileError: No cell is occupied, or none is free.
+    Raises MapFileError if no cell is occupied, or none is free.
     """
     occupied, free, cell = occupancy.occupied, occupancy.free, occupancy.cell
     for what, some in (("occupied", occupied), ("free", free)):

@@ -69,8 +69,7 @@ def encode_sightings(frame_id: str, stamp_ns: int, sightings: Sightings) -> byte
 def decode_sightings(data: bytes) -> tuple[int, Sightings]:
     """Stamp [ns] and columns of a serialized SwarmSightings.
 
-    Raises:
-        CdrError: The message is incomplete, or its columns differ in length.
+    Raises CdrError if the message is incomplete, or its columns differ in length.
     """
     message = decode(data, SWARM_SIGHTINGS)
     header, *columns = vars(message).values()

@@ -77,8 +77,7 @@ class Exposure:
 class EpuckWorld:
     """The robots of a swarm in their arena; each needs a start pose and a camera, every marker a heading.
 
-    Raises:
-        WorldError: The swarm cannot be simulated.
+    Raises WorldError if the swarm cannot be simulated.
     """
 
     def __init__(self, swarm: Swarm, settings: EpuckWorldSettings) -> None:
@@ -230,11 +229,7 @@ class SimulatedEpuck:
 
 
 def check_swarm(swarm: Swarm) -> None:
-    """Check that a swarm can be simulated.
-
-    Raises:
-        WorldError: A robot or a marker lacks something.
-    """
+    """Check that a swarm can be simulated; raises WorldError if a robot or a marker lacks something."""
     for robot in swarm.robots:
         start_of(robot)
         if robot.camera is None:

@@ -75,10 +75,8 @@ def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> Bo
 def floor_plan(plan: str) -> FloorPlan:
     """A floor plan by its name in `FLOOR_PLANS`, or from a YAML or JSON file.
 
-    A file has either walls with the keys of `floor_plans.json`, or a map of ROS's map_server.
-
-    Raises:
-        UserError: There is no such plan, or the file cannot be used.
+    A file has either walls with the keys of `floor_plans.json`, or a map of ROS's map_server. Raises
+    UserError if there is no such plan, or the file cannot be used.
     """
     if plan in FLOOR_PLANS:
         return FLOOR_PLANS[plan]
@@ -94,11 +92,7 @@ def floor_plan(plan: str) -> FloorPlan:
 
 
 def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
-    """A floor plan from its description.
-
-    Raises:
-        FloorPlanError: The description cannot be used.
-    """
+    """A floor plan from its description; raises FloorPlanError if the description cannot be used."""
     about = checks.mapping(tree, WHOLE_FILE, _KEYS)
 
     def rows(tree: Tree, key: str, width: int) -> list[tuple[float, ...]]:
@@ -131,8 +125,7 @@ def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
 def _plan_of_map(path: Path) -> FloorPlan:
     """The walls around the occupied cells of a map; where its image ends is a wall, too.
 
-    Raises:
-        UserError: The map cannot be used.
+    Raises UserError if the map cannot be used.
     """
     grid = load_map(path)
     # lines (S, 4) between solid and free cells of the grid (nx, ny), in cells; all around it is solid
@@ -146,11 +139,7 @@ def _plan_of_map(path: Path) -> FloorPlan:
 
 
 def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
-    """A plan without walls of no length.
-
-    Raises:
-        FloorPlanError: It has no walls, or too many.
-    """
+    """A plan without walls of no length; raises FloorPlanError if it has no walls, or too many."""
     lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
     walls = plan.walls[lengths > 0.0]
     if not 0 < len(walls) <= _MAX_WALLS:

@@ -84,8 +84,7 @@ class PushbotWorldParameters(LinkedWorldParameters):
 class PushbotWorld:
     """Robots in a hall; of the parameters, files, links and the plan's name are not used.
 
-    Raises:
-        WorldError: A robot starts within a wall or another robot.
+    Raises WorldError if a robot starts within a wall or another robot.
     """
 
     def __init__(self, starts: list[Pose2], plan: FloorPlan, params: PushbotWorldParameters) -> None:
@@ -174,8 +173,7 @@ class SimulatedPushbot:
 def make_pushbot_world(params: PushbotWorldParameters) -> tuple[Swarm, PushbotWorld]:
     """The swarm as described, and its world.
 
-    Raises:
-        UserError: A parameter, the swarm description or the floor plan cannot be used.
+    Raises UserError if a parameter, the swarm description or the floor plan cannot be used.
     """
     swarm = load_swarm(Path(params.swarm_file))
     try:

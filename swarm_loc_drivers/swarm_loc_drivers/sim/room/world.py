@@ -49,8 +49,7 @@ class Room:
 def room_of(swarm: Swarm, plan: str) -> Room:
     """The room of a swarm: that of a plan, if one is given.
 
-    Raises:
-        UserError: The plan or the map cannot be used.
+    Raises UserError if the plan or the map cannot be used.
     """
     path = swarm.map if isinstance(swarm.map, Path) else None
     if path is not None and path.exists():
@@ -100,11 +99,7 @@ def radius_of(robot: Robot) -> float:
 
 
 def room_starts(swarm: Swarm, room: Room, seed: int) -> FloatArray:
-    """Poses (N, 3) in the room, off its walls and each other.
-
-    Raises:
-        WorldError: The room is too small.
-    """
+    """Poses (N, 3) in the room, off its walls and each other; raises WorldError if the room is too small."""
     rng = np.random.default_rng([seed, len(swarm.robots)])
     radius = max(radius_of(robot) for robot in swarm.robots)
     free = np.pad(room.map.free, 1).astype(np.uint8)

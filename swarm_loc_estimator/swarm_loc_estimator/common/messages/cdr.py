@@ -214,9 +214,7 @@ def decode(data: bytes, message_type: str, places: dict[str, list[int]] | None =
     `places` gets the offsets of each field by its path, such as "robots.x"; those of strings and sequences
     are of their length. The fields are attributes of the result: numbers, texts, arrays of numbers, messages.
     A sequence of messages of fixed size is a structured array, see `row_dtype`; any other one is a list.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
+    Raises CdrError if the bytes are not one whole message.
     """
     reader = _CdrReader(data, places)
     message = reader.message(message_type)

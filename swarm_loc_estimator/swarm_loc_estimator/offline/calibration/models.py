@@ -145,10 +145,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 
     Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
     and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
-    are more rounds.
-
-    Raises:
-        CalibrationError: Too little is known about the poses of robots.
+    are more rounds. Raises CalibrationError if too little is known about the poses of robots.
     """
     begin, truth = problem_of(recording, swarm, ranged=True), recording.truth
     if options.plain:

@@ -76,8 +76,7 @@ class Exchange:
 def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
     """All exchanges of a file in the order of their times, and the number of unusable lines by reason.
 
-    Raises:
-        DropletRecordingError: It cannot be read, or holds no exchange.
+    Raises DropletRecordingError if it cannot be read, or holds no exchange.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -301,10 +300,8 @@ def find_fiducials(
     """Find the orientation of all fiducials of a recording.
 
     `poses` has one mapping per exchange: robot -> pose in the image; angles (n,) are directions of the
-    elements in base_link [rad].
-
-    Raises:
-        DropletRecordingError: Matrices and camera contradict each other however the image is turned.
+    elements in base_link [rad]. Raises DropletRecordingError if matrices and camera contradict each other
+    however the image is turned.
     """
     floor = _CLEAR * _noise(exchanges)
     rows = [

@@ -70,8 +70,7 @@ class Dataset:
 def read_dataset(folder: Path) -> Dataset:
     """Read a folder, and correct barcodes that contradict the ground truth.
 
-    Raises:
-        MrclamError: It holds no such dataset, or a damaged file.
+    Raises MrclamError if it holds no such dataset, or a damaged file.
     """
     subjects = sorted(
         int(match[1]) for path in folder.glob("Robot*") if (match := _ODOMETRY.fullmatch(path.name))
@@ -271,8 +270,7 @@ def convert(
 ) -> MrclamImport:
     """Write a set as a bag with its `swarm.yaml` inside; robots start where their ground truth begins.
 
-    Raises:
-        BagError: The folder is there already, or cannot be created.
+    Raises BagError if the folder is there already, or cannot be created.
     """
     rng = np.random.default_rng(delay.seed)
     streams: list[Stream] = []

@@ -321,8 +321,7 @@ class BoardRecording:
 def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
     """The exchanges with ground truth of the first kind of board of a swarm.
 
-    Raises:
-        CalibrationError: There are none.
+    Raises CalibrationError if there are none.
     """
     group, stamp_ns = exchanges_of(recording, swarm)
     known = np.isfinite(group.exchanges.poses[:, 0])
@@ -341,11 +340,7 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
 def calibrate_from(
     recording: Recording, swarm: Swarm, progress: Progress
 ) -> tuple[BoardRecording, BoardCalibration]:
-    """Calibrate the board of a recording.
-
-    Raises:
-        CalibrationError: There is too little ground truth.
-    """
+    """Calibrate the board of a recording; raises CalibrationError if there is too little ground truth."""
     progress(0.0, "exchanges")
     board = read_board(recording, swarm)
     progress(0.1, "fitting, and validating on blocks of time")
@@ -452,10 +447,8 @@ class BoardCalibration:
 def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
     """Calibrate a board by exchanges with known poses.
 
-    The initial platform defines the arrangement and the saturation count.
-
-    Raises:
-        CalibrationError: There are too few exchanges.
+    The initial platform defines the arrangement and the saturation count. Raises CalibrationError if there
+    are too few exchanges.
     """
     if len(data.receiver) < MIN_EXCHANGES:
         raise CalibrationError(

@@ -219,10 +219,8 @@ def calibrate_infrared(
 ) -> InfraredCalibration:
     """Calibrate the gains of all robots with infrared boards; described gains are ignored.
 
-    `with_truth`: whether to use ground truth where it is known.
-
-    Raises:
-        CalibrationError: No exchange can be used, or no gains are determined.
+    `with_truth`: whether to use ground truth where it is known. Raises CalibrationError if no exchange can be
+    used, or no gains are determined.
     """
     groups, dropped = _groups(recording, swarm, with_truth=with_truth)
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
@@ -248,8 +246,7 @@ def calibrate_infrared(
 def exchanges_of(recording: Recording, swarm: Swarm) -> tuple[BoardGroup, IntArray]:
     """The exchanges of the robots with the first kind of board, and their stamps (k,).
 
-    Raises:
-        CalibrationError: No exchange can be used.
+    Raises CalibrationError if no exchange can be used.
     """
     (group, stamps_ns), *_ = _groups(recording, swarm, with_truth=True)[0]
     return group, stamps_ns
@@ -294,8 +291,7 @@ def _groups(
 ) -> tuple[list[tuple[BoardGroup, IntArray]], Counter[str]]:
     """Exchanges by kind of board with their stamps, and the number of unusable matrices by reason.
 
-    Raises:
-        CalibrationError: No matrix can be used.
+    Raises CalibrationError if no matrix can be used.
     """
     screening = MatrixScreening(swarm)
     if not screening.boards:
