@@ -24,8 +24,7 @@ from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER, HANDLING_NS, message_ns
 
 TERMINATOR = b"\r"
-ERASE = b"\b"
-"""Deletes the last character of the line; the console answers `\\b \\b` even for an empty line."""
+ERASE = b"\b"  # Deletes the last character of the line; the console answers `\b \b` even for an empty line
 BACKSPACES_PER_ERASE = 2
 
 MAX_LINE = 63  # The line buffer has 64 characters, including the terminator

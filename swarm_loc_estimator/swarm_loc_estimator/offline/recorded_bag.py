@@ -70,18 +70,12 @@ def truth_topics(swarm: Swarm) -> list[str]:
 class BagLocalizer:
     """Turns messages of the localizer of a swarm into fixes or ground truth, as `localizer_bridge` does live.
 
-    Args:
-        swarm: Describes the localizer, or none.
-        recorded: Topics of the bag.
-
-    Attributes:
-        topics: Topics of the localizer that are recorded.
-        outputs: Topics of the robots that it locates.
+    The swarm describes the localizer, or none; `recorded` are the topics of the bag.
     """
 
     def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
-        self.topics: list[str] = []
-        self.outputs: dict[str, BagTopic] = {}
+        self.topics: list[str] = []  # Topics of the localizer that are recorded
+        self.outputs: dict[str, BagTopic] = {}  # Topics of the robots that it locates
         self._missing: list[str] = []
         self._health = Health(lambda _: None)
         if (localizer := swarm.localizer) is None:

@@ -120,14 +120,12 @@ class DropletWorld:
         count = len(ids)
         self.ids = np.array(ids, dtype=np.int64)
         self.now_ns = settings.start_ns
-        self.poses: FloatArray = np.array(start, dtype=float)
-        """(N, 3) true poses of the robots in map."""
+        self.poses: FloatArray = np.array(start, dtype=float)  # (N, 3) true poses of the robots in map
         self._twists = np.zeros((count, 3))
         self._true = self._true_velocities(count)
         rng = self._random(settings.seed if settings.boards is None else settings.boards, _GAINS)
         gains = np.exp(settings.errors.gain_sigma * rng.standard_normal((2, count, ELEMENTS)))
-        self.gains: FloatArray = gains
-        """(2, N, n) true factors of sensors and emitters."""
+        self.gains: FloatArray = gains  # (2, N, n) true factors of sensors and emitters
         self.infrared = DropletInfrared(
             settings.platform,
             DropletLight(settings.platform, gains, NEAR_POWER),

@@ -117,8 +117,7 @@ class EpuckWorld:
         phases = self._random(_PHASES).integers(0, self._period_ns, count)
         self._first_ns: list[int] = (first_ns + phases).tolist()
         self._next = [self._exposure(robot, 0) for robot in range(count)]
-        self.newest: list[Exposure | None] = [None] * count
-        """The last image that each camera has taken."""
+        self.newest: list[Exposure | None] = [None] * count  # The last image that each camera has taken
 
     def step(self) -> list[Exposure]:
         """Step by STEP_NS; returns the images taken meanwhile, by stamp."""
@@ -161,10 +160,6 @@ class EpuckWorld:
         self.newest[robot] = exposure
         self._next[robot] = self._exposure(robot, exposure.number + 1)
         return exposure
-
-    def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
-        """The exposure of a camera nearest to a stamp, at any time."""
-        return self._exposure(robot, round((stamp_ns - self._first_ns[robot]) / self._period_ns))
 
     def _exposure(self, robot: int, number: int) -> Exposure:
         """The exposure of a number; it happens before its stamp, by the world's error."""

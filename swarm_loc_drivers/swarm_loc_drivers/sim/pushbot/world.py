@@ -95,13 +95,11 @@ class PushbotWorld:
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
         """(N, 3) true poses of the robots in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
-        self.optics = assembled_robots(params.seed, count)
-        """Optics of the robots, for evaluation."""
+        self.optics = assembled_robots(params.seed, count)  # Optics of the robots, for evaluation
         self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""
         self.firmwares: list[PushbotFirmware | None] = [None] * count
-        self.sight = HallSight(plan.walls, self.optics, params.camera, rng)
-        """The event cameras of the robots."""
+        self.sight = HallSight(plan.walls, self.optics, params.camera, rng)  # The event cameras of the robots
         self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
         self._drive = Drive(params.wheel_separation, params.wheel_noise, params.turn_slip)
         self._radii = np.full(count, BODY_RADIUS_M)

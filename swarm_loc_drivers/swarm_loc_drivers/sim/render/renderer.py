@@ -43,8 +43,7 @@ _NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64  # Of these ways, and from which 
 _NOISE_LENGTH = 1 << 20
 
 
-PosesAt = Callable[[IntArray], FloatArray]
-"""True poses (K, N, 3) of all robots in map at times (K,) [ns]."""
+PosesAt = Callable[[IntArray], FloatArray]  # True poses (K, N, 3) of all robots in map at times (K,) [ns]
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,7 @@ class RoomWorld:
         """(N, 3) true poses of the robots in map."""
         self.reported: FloatArray = np.zeros_like(self.poses)
         """(N, 3) poses by odometry, each robot's own frame."""
-        self.radii = np.array([radius_of(robot) for robot in swarm.robots])
-        """(N,) of the bodies [m]."""
+        self.radii = np.array([radius_of(robot) for robot in swarm.robots])  # (N,) of the bodies [m]
         models = [robot.odometry for robot in swarm.robots]
         scales = [[one.distance_scale, one.turn_scale] for one in models]
         sigmas = [[one.distance_scale_sigma, one.turn_scale_sigma] for one in models]

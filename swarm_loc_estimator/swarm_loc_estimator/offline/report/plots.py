@@ -201,8 +201,7 @@ def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray]
     return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
 
 
-IN_MAP = "x in map [m]", "y in map [m]"
-"""Labels of axes."""
+IN_MAP = "x in map [m]", "y in map [m]"  # Labels of axes
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6  # Height of title, legend and axes
 _AROUND_MAP = Margins(left=0.65, right=0.15, bottom=0.9, top=0.7, across=0.5, down=0.6)
