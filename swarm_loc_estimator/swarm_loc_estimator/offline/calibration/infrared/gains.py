@@ -354,17 +354,17 @@ def _with_fits(
                 why = "What they read contradicts itself or the ground truth"
             elif not board.helps[place]:
                 why = "Gains do not help in exchanges that they were not estimated from"
-            alive = _without_dead(robots[index], board.elements, place)
-            changed[index] = alive if why else _with_gains(alive, gains)
+            changed[index] = _with_fit(robots[index], board, place, with_gains=not why)
             if why:
                 left.setdefault(why, []).append(robots[index].name)
     return tuple(changed), left
 
 
-def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
-    """The robot with its dead elements; an element described as dead stays so unless it certainly works."""
+def _with_fit(robot: Robot, board: BoardFit, place: int, *, with_gains: bool) -> Robot:
+    """The robot with gains and dead elements; one described as dead stays so unless it certainly works."""
     if robot.ir is None:
         return robot
+    elements, gains = board.elements, board.fit.gains[place]
     described = (robot.ir.dead_sensors, robot.ir.dead_emitters)
     dead = [
         tuple(sorted({*found, *(k for k in before if not works[k])}))
@@ -372,15 +372,11 @@ def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
             elements.numbers(place), described, elements.works[:, place], strict=True
         )
     ]
-    return replace(robot, ir=replace(robot.ir, dead_sensors=dead[0], dead_emitters=dead[1]))
-
-
-def _with_gains(robot: Robot, gains: IrGains) -> Robot:
-    if robot.ir is None:
-        return robot
+    alive = replace(robot.ir, dead_sensors=dead[0], dead_emitters=dead[1])
     sensor, emitter = (tuple(round(v, _DECIMALS) for v in part) for part in (gains.sensor, gains.emitter))
     own, common = (round(sigma, _DECIMALS) for sigma in (gains.sigma, gains.common_sigma))
-    return replace(robot, ir=replace(robot.ir, gains=IrGains(sensor, emitter, own, common)))
+    calibrated = replace(alive, gains=IrGains(sensor, emitter, own, common))
+    return replace(robot, ir=calibrated if with_gains else alive)
 
 
 def _counts(dropped: Counter[str]) -> str:
