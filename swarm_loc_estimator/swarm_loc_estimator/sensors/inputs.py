@@ -330,7 +330,7 @@ MAX_PAUSE_NS = 3_600_000_000_000
 
 CLOCKS_APART_S = 0.2  # Difference between the clock of a robot and those of the others that is named [s]
 
-_OF_MESSAGES = ("received", "malformed", "last_stamp_ns", "first_arrival_ns", "last_arrival_ns")
+_OF_MESSAGES = ("received", "malformed", "first_arrival_ns", "last_arrival_ns")
 _LATE = ("late_sum_ns", "late_min_ns", "late_max_ns", "late_count")
 # as floats, since a sum of absurd delays exceeds int64
 _TYPES = {"late_sum_ns": np.float64}
@@ -352,11 +352,6 @@ class InputStatistics:
     def malformed(self) -> int:
         """Number of malformed messages."""
         return int(self._row["malformed"][0])
-
-    @property
-    def last_stamp_ns(self) -> int | None:
-        """Stamp of the newest valid message; None before the first."""
-        return int(self._row["last_stamp_ns"][0]) if self.received > self.malformed else None
 
     @property
     def last_arrival_ns(self) -> int | None:
@@ -526,7 +521,7 @@ def _count(
         if one.received - one.malformed == 1:
             one.first_arrival_ns = arrival_ns[k]
         late_ns = arrival_ns[k] - stamp_ns[k]
-        one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
+        one.last_arrival_ns = arrival_ns[k]
         one.late_min_ns = min(one.late_min_ns, late_ns) if one.late_count else late_ns
         one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns
         one.late_sum_ns += late_ns
