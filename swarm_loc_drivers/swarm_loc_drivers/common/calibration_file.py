@@ -35,8 +35,7 @@ class CameraCalibration:
 def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:
     """Read the calibration of a camera whose images have this size [px].
 
-    Raises:
-        CalibrationFileError: The file cannot be read, is incomplete, or is for another image size.
+    Raises CalibrationFileError if the file cannot be read, is incomplete, or is for another image size.
     """
     tree = read_tree(path, CalibrationFileError)
     if not isinstance(tree, dict):

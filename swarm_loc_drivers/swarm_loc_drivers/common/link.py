@@ -46,8 +46,7 @@ class Address:
 def parse_address(text: str, default_port: int) -> Address:
     """The address in a parameter `address`: `/dev/rfcomm0` or `tcp://192.168.1.1[:1000]`.
 
-    Raises:
-        ParameterError: It is neither.
+    Raises ParameterError if it is neither.
     """
     if text.startswith("/"):
         return Address(device=text)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
-from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Twist, Vector3
+from geometry_msgs.msg import Quaternion, Twist
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -29,7 +29,7 @@ from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import NO_CLOCK, DriverParameters, RobotDriver, Velocity
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report, level_of
-from swarm_loc_estimator.common.messages.poses import PLANE
+from swarm_loc_estimator.common.messages.poses import PLANE, TransformsEncoder, encode_odometry
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
 
 ODOMETRY_QOS = QoSProfile(depth=10)
@@ -48,23 +48,6 @@ def yaw_quaternion(yaw: float) -> Quaternion:
     return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
 
 
-def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> Odometry:
-    """The state as nav_msgs/Odometry, its covariances over x, y, z, and rotation about X, Y, Z."""
-    message = Odometry(
-        header=Header(stamp=stamp_message(state.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame
-    )
-    position, twist = message.pose.pose.position, message.twist.twist
-    position.x, position.y, yaw = (float(value) for value in state.pose)
-    message.pose.pose.orientation = yaw_quaternion(yaw)
-    twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in state.twist)
-    covariance, twist_covariance = np.eye(6) * _FIXED_VARIANCE, np.eye(6) * _FIXED_VARIANCE
-    covariance[PLANE] += state.covariance
-    twist_covariance[PLANE] += state.twist_covariance
-    message.pose.covariance = covariance.ravel()
-    message.twist.covariance = twist_covariance.ravel()
-    return message
-
-
 class OdometryOutput:
     """Publishes the odometry of one robot: the pose of `base_frame` in `odom_frame`.
 
@@ -76,23 +59,17 @@ class OdometryOutput:
     ) -> None:
         self._odometry = node.create_publisher(Odometry, topic, ODOMETRY_QOS)
         self._frames = odom_frame, base_frame
-        self._transforms = transforms
+        self._transforms, self._encoder = transforms, TransformsEncoder(odom_frame, [base_frame])
 
     def publish(self, state: OdometryState) -> None:
         """Publish a state."""
-        message = odometry_message(state, *self._frames)
-        self._odometry.publish(message)
+        covariances = np.tile(_FIXED_VARIANCE * np.eye(6), (2, 1, 1))
+        for whole, planar in zip(covariances, (state.covariance, state.twist_covariance), strict=True):
+            whole[PLANE] += planar
+        stamp_ns, pose, twist = np.array([state.stamp_ns]), state.pose[None], state.twist[None]
+        self._odometry.publish(encode_odometry(*self._frames, stamp_ns, pose, twist, *covariances)[0])
         if self._transforms is not None:
-            pose, header, child = message.pose.pose, message.header, message.child_frame_id
-            place = Vector3(x=pose.position.x, y=pose.position.y)
-            moved = Transform(translation=place, rotation=pose.orientation)
-            found = TransformStamped(header=header, child_frame_id=child, transform=moved)
-            self._transforms.publish(TFMessage(transforms=[found]))
-
-
-def transform_publisher(node: Node) -> Publisher:
-    """The publisher of /tf, an absolute name because tf2 listens only there."""
-    return node.create_publisher(TFMessage, "/tf", _TF_QOS)
+            self._transforms.publish(self._encoder.encode(state.stamp_ns, np.ones(1, np.bool_), pose))
 
 
 def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
@@ -144,7 +121,10 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
         robot = self.get_namespace().strip("/")
         self._prefix = f"{robot}/" if robot else ""  # Of the robot's frames and of its status
         self._base_frame = f"{self._prefix}{self.params.base_frame}"
-        self._transforms = transform_publisher(self) if self.params.publish_tf else None
+        # an absolute name because tf2 listens only there
+        self._transforms = (
+            self.create_publisher(TFMessage, "/tf", _TF_QOS) if self.params.publish_tf else None
+        )
 
     def start(self) -> None:
         """Start the driver; not when constructed, since an interrupt there would not stop the robot."""

@@ -29,7 +29,7 @@ from swarm_loc_drivers.droplet.exchange import (
     TdmaSettings,
 )
 from swarm_loc_drivers.droplet.hardware import BAUD_RATE, DIRECTIONS, RADIUS_M, Gait, gait
-from swarm_loc_drivers.droplet.odometry import CommandedMotion
+from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
 from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_drivers.droplet.protocol import (
     BROKEN,
@@ -287,9 +287,10 @@ class DropletDriver(RobotDriver[DropletSession]):
         self._odometry_due_ns = 0
         self._commands: dict[str, VelocityCommand] = {}
         self._movers: dict[str, DropletMover] = {}
+        noise = MotionNoise(params.walk_noise, params.veer_noise, params.turn_noise)
         for name, target in {OWN: None, **params.relayed_ids}.items():
             command = self._commands[name] = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
-            motion, loss = CommandedMotion(params.motion_noise), params.relay_loss if name != OWN else 0.0
+            motion, loss = CommandedMotion(noise), params.relay_loss if name != OWN else 0.0
             self._movers[name] = DropletMover(command, motion, params.stride_s, target, loss)
 
     def set_velocity(self, name: str, velocity: Velocity) -> None:

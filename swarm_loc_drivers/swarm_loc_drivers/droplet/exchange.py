@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.hardware import (
@@ -28,6 +27,7 @@ from swarm_loc_drivers.droplet.hardware import (
     DropletModel,
 )
 from swarm_loc_drivers.droplet.protocol import MARGIN_NS, ConsoleTalk, Matrix, Said, SendAborted, Talk, relay
+from swarm_loc_estimator.common.arrays import IntArray
 
 _BRIGHTER = 1.5
 """Least ratio of the sums of the far and the near matrix of a pair, at any distance up to 30 cm."""
@@ -50,7 +50,7 @@ class Brightness:
     stamp_ns: int  # Middle of the exchange [ns]; of both powers, where both were measured
     transmitter: int  # Id of the robot that emitted
     power: Power  # Power of the emitters
-    readings: NDArray[np.int64]  # (n, n) [count], sensors by emitters
+    readings: IntArray  # (n, n) [count], sensors by emitters
 
 
 Publish = Callable[[Brightness], None]

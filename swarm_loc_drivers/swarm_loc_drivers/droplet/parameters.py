@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from swarm_loc_drivers.common.robot_driver import DriverParameters
 from swarm_loc_drivers.droplet.exchange import MIN_TURN_S, PollingSettings, SessionSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
-from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
@@ -40,8 +39,7 @@ class DropletTraits(DriverParameters):
 class DropletParameters(DropletTraits):
     """Parameters of `droplet_driver_node`.
 
-    Raises:
-        ParameterError: A parameter is invalid, or conflicts with another one.
+    Raises ParameterError if a parameter is invalid, or conflicts with another one.
     """
 
     address: str = text("", "the serial port of the Droplet at the cable", required=True)
@@ -92,11 +90,6 @@ class DropletParameters(DropletTraits):
             period_s = 1.0 / self.exchange_rate if self.exchange_rate else 0.0
             exchanges = PollingSettings(known, period_s, self.retries, powers, self.least_brightness)
         return SessionSettings(DROPLET_MODELS[self.model], ELEMENTS, self.reply_timeout_s, exchanges)
-
-    @property
-    def motion_noise(self) -> MotionNoise:
-        """Noise of commanded motion."""
-        return MotionNoise(self.walk_noise, self.veer_noise, self.turn_noise)
 
     @property
     def relayed_ids(self) -> dict[str, int]:

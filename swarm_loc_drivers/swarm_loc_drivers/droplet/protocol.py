@@ -24,8 +24,7 @@ from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER, HANDLING_NS, message_ns
 
 TERMINATOR = b"\r"
-ERASE = b"\b"
-"""Deletes the last character of the line; the console answers `\\b \\b` even for an empty line."""
+ERASE = b"\b"  # Deletes the last character of the line; the console answers `\b \b` even for an empty line
 BACKSPACES_PER_ERASE = 2
 
 MAX_LINE = 63  # The line buffer has 64 characters, including the terminator
@@ -62,8 +61,7 @@ def set_power(power: int) -> str:
 def for_robot(robot: int, line: str) -> str:
     """Send a line by infrared to another robot, which executes it like a typed one.
 
-    Raises:
-        CommandError: The line is too long.
+    Raises CommandError if the line is too long.
     """
     if len(line) > MAX_TARGETED_LINE:
         raise CommandError(f"'{line}' is too long: another robot takes {MAX_TARGETED_LINE} characters.")
@@ -73,8 +71,7 @@ def for_robot(robot: int, line: str) -> str:
 def typed(line: str) -> bytes:
     """The characters of a line, without its end.
 
-    Raises:
-        CommandError: The line is empty, too long or not printable.
+    Raises CommandError if the line is empty, too long or not printable.
     """
     if not 0 < len(line) <= MAX_LINE or not line.isascii() or not line.isprintable():
         raise CommandError(f"{line!r} must be 1 to {MAX_LINE} printable ASCII characters.")
@@ -330,8 +327,7 @@ class ConsoleTalk:
     def enter(self, line: str) -> Talk[int]:
         """Type and terminate a line; the time at which the robot accepted it [ns].
 
-        Raises:
-            SessionError: The robot does not echo the line in several attempts.
+        Raises SessionError if the robot does not echo the line in several attempts.
         """
         for _ in range(_TRIES):
             self._output += typed(line)
@@ -365,8 +361,7 @@ class ConsoleTalk:
 def relay(console: ConsoleTalk, target: int, line: str) -> Talk[int]:
     """Send a line to another robot, without confirmation; the time at which it executes the line [ns].
 
-    Raises:
-        SessionError: The robot at the cable does not echo the line.
+    Raises SessionError if the robot at the cable does not echo the line.
     """
     sent_ns = yield from console.enter(for_robot(target, line))
     due_ns = sent_ns + message_ns(len(line)) + HANDLING_NS

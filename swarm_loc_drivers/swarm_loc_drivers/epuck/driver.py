@@ -15,17 +15,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
 from swarm_loc_drivers.common.robot_driver import RobotDriver, Velocity, VelocityCommand
-from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckSession, as_counter, unwrapped_difference
+from swarm_loc_drivers.epuck.hardware import CameraImage, as_counter, unwrapped_difference
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
+EpuckSession = SerialSession | WifiSession
 Rates = tuple[float, float]
 
 # Checked by test_epuck_motion.py and by the bad links of test_epuck_sessions.py.
@@ -167,7 +167,7 @@ class EpuckListeners:
     """Receivers of the robot's data, called in the driver's thread."""
 
     odometry: Callable[[OdometryState], None]  # Receives every new state
-    proximity: Callable[[int, NDArray[np.int64]], None]  # Receives stamps [ns] and raw values (8,)
+    proximity: Callable[[int, IntArray], None]  # Receives stamps [ns] and raw values (8,)
     image: Callable[[CameraImage], None]  # Receives images
 
 

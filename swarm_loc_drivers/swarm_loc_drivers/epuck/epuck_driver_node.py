@@ -12,9 +12,7 @@ import math
 from functools import partial
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import Transform, TransformStamped, Vector3
-from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Range
 from std_msgs.msg import Header
@@ -38,6 +36,7 @@ from swarm_loc_drivers.epuck.hardware import (
     range_of_raw,
 )
 from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.node import run_node
 
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -88,7 +87,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         self._follow("cmd_vel", self._driver.set_velocity)
         self.create_timer(1.0 / params.reading_rate, self._driver.tick)
 
-    def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
+    def _publish_proximity(self, stamp_ns: int, raw: IntArray) -> None:
         """Publish raw proximity values (8,) as ranges."""
         if not any(publisher.get_subscription_count() for publisher in self._proximity):
             return

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.common.robot_driver import Session
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
 
@@ -160,7 +158,7 @@ class Reading:
     doubt_ns: int  # Uncertainty of the stamp in both directions [ns]
     left_counter: int  # Steps of the left wheel, 16 bits, wrapping
     right_counter: int  # Steps of the right wheel, 16 bits, wrapping
-    proximity: NDArray[np.int64]  # (8,) raw values of ps0..ps7
+    proximity: IntArray  # (8,) raw values of ps0..ps7
 
 
 @dataclass(frozen=True)
@@ -169,13 +167,3 @@ class CameraImage:
 
     stamp_ns: int  # Best estimate of the exposure time [ns]
     pixels: Image  # (height, width, 3) RGB
-
-
-class EpuckSession(Session, Protocol):
-    """A conversation with one e-puck."""
-
-    found: list[Reading | CameraImage]  # Measurements; the reader empties the list
-    is_idle: bool  # Whether no answer is pending: the next step sends a request
-
-    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """See `TalkSession.step`."""

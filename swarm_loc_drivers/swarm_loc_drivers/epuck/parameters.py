@@ -33,8 +33,7 @@ _ODOMETRY = OdometryModel()
 class EpuckParameters(DriverParameters):
     """Parameters of `epuck_driver_node`.
 
-    Raises:
-        ParameterError: A parameter is invalid, or conflicts with another one.
+    Raises ParameterError if a parameter is invalid, or conflicts with another one.
     """
 
     address: str = text(
@@ -119,11 +118,7 @@ class EpuckParameters(DriverParameters):
 
 
 def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> CameraCalibration:
-    """Calibration of the camera's images.
-
-    Raises:
-        ParameterError: The file is not set or cannot be used.
-    """
+    """Calibration of the camera's images; raises ParameterError if the file is not set or cannot be used."""
     if not parameters.camera_info_file:
         raise ParameterError(
             "parameter camera_info_file is not set: a camera without calibration cannot be published."

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.robot_driver import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
 from swarm_loc_drivers.epuck.hardware import (
@@ -29,6 +28,7 @@ from swarm_loc_drivers.epuck.hardware import (
     decode_rgb565,
 )
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_estimator.common.arrays import IntArray
 
 END = 0
 RGB565_MODE = 1
@@ -92,7 +92,7 @@ def _request(left: int, right: int, letters: str, size: int) -> Request:
     return Request(queries, _SPEEDS.pack(left, right), size)
 
 
-def decode_readings(body: bytes) -> tuple[int, int, NDArray[np.int64]]:
+def decode_readings(body: bytes) -> tuple[int, int, IntArray]:
     """Counters of the left and the right wheel, 16 bits, and raw values (8,) of ps0..ps7."""
     left, right, *proximity = _READINGS.unpack(body)
     return left, right, np.array(proximity, np.int64)
@@ -139,7 +139,7 @@ _NS = 1_000_000_000
 
 
 class SerialSession(TalkSession):
-    """Requests readings at every step that finds it idle, and images in between; see `EpuckSession`.
+    """Requests readings at every step that finds it idle, and images in between; a `Session`.
 
     `doubt` is called when it is unknown which commands the robot has received. Counts `exchanges`,
     `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
@@ -149,8 +149,8 @@ class SerialSession(TalkSession):
         self, params: EpuckParameters, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
     ) -> None:
         super().__init__(counts)
-        self.is_idle = False
-        self.found: list[Reading | CameraImage] = []
+        self.is_idle = False  # Whether no answer is pending: the next step sends a request
+        self.found: list[Reading | CameraImage] = []  # Measurements; the reader empties the list
         self._params = params
         self._wanted_speeds = speeds
         self._doubt = doubt

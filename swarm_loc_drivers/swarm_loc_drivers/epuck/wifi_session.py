@@ -212,7 +212,7 @@ class _Arrival(NamedTuple):
 
 
 class WifiSession:
-    """Sends commands and receives the stream; see `EpuckSession`.
+    """Sends commands and receives the stream; a `Session`.
 
     The robot reads new values into a second buffer as soon as it has sent a message, and sends them with the
     next message of that kind. So the stamp of a message is the arrival of the previous one. Messages without
@@ -221,11 +221,11 @@ class WifiSession:
     Counts `messages`, `stray_bytes`, `resyncs`.
     """
 
-    is_idle = False
+    is_idle = False  # No answer is pending that the next step would ask for
 
     def __init__(self, params: EpuckParameters, speeds: Speeds, counts: Counter[str]) -> None:
         self.ending = self.connected = self.ended = False
-        self.found: list[Reading | CameraImage] = []
+        self.found: list[Reading | CameraImage] = []  # Measurements; the reader empties the list
         self._camera = params.camera
         self._period_ns = round(1e9 / params.reading_rate)
         self._silence_s = _FIRMWARE_PAUSE_S + params.reply_timeout_s
@@ -239,7 +239,7 @@ class WifiSession:
         self._due_ns = 0
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """See `EpuckSession.step`."""
+        """See `TalkSession.step`."""
         newest: dict[int, Message] = {}
         skipped, resyncs = self._parser.skipped, self._parser.resyncs
         messages = self._parser.feed(data, now_ns) if data else []

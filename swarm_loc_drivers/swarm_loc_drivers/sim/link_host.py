@@ -22,24 +22,6 @@ _MAX_CLIENTS = 9
 """Number of client sockets: the firmware never closes one, and has ten including the server's."""
 
 
-class _Port(Protocol):
-    """Something with a file descriptor that can be read."""
-
-    def fileno(self) -> int: ...
-
-    def on_readable(self) -> None:
-        """Read and process pending input."""
-
-    def on_cycle(self) -> None:
-        """Send pending output."""
-
-    def is_used(self) -> bool:
-        """Whether a client is connected."""
-
-    def close(self) -> None:
-        """Close the descriptor."""
-
-
 class ConsoleFirmware(Protocol):
     """A firmware at a serial port."""
 
@@ -78,11 +60,13 @@ class _PtyPort:
         return self._master
 
     def on_readable(self) -> None:
+        """Read and answer pending input."""
         with contextlib.suppress(BlockingIOError):
             if answer := self._firmware.receive(os.read(self._master, _CHUNK)):
                 self._send(answer)
 
     def on_cycle(self) -> None:
+        """Send pending output."""
         self._send(self._unsent or self._firmware.stream())
 
     def is_used(self) -> bool:
@@ -180,7 +164,7 @@ class FirmwareHost:
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
-        self._ports: list[_Port] = []
+        self._ports: list[_PtyPort | _TcpPort] = []
 
     def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
         """Put a firmware at a pseudo-terminal; returns the path for a driver.
@@ -198,7 +182,7 @@ class FirmwareHost:
         self._add(server)
         return server.port
 
-    def _add(self, port: _Port) -> None:
+    def _add(self, port: _PtyPort | _TcpPort) -> None:
         self._ports.append(port)
         self._selector.register(port, selectors.EVENT_READ, port.on_readable)
 

@@ -93,8 +93,7 @@ class RobotType:
 def robot_type_of(swarm: Swarm) -> RobotType:
     """The kind of a swarm's robots; those of any other type are e-pucks, or in a room if none has a camera.
 
-    Raises:
-        WorldError: The robots are of several kinds.
+    Raises WorldError if the robots are of several kinds.
     """
     kinds = {robot.name: ROBOT_TYPES.get(robot.type, EPUCK) for robot in swarm.robots}
     first = next((kind for kind in kinds.values() if kind is not EPUCK), EPUCK)
@@ -109,8 +108,7 @@ def robot_type_of(swarm: Swarm) -> RobotType:
 def simulated_swarm(options: SimulationOptions) -> Swarm:
     """The swarm of a simulation, checked before any process starts.
 
-    Raises:
-        UserError: A file cannot be used, or the swarm cannot be simulated.
+    Raises UserError if a file cannot be used, or the swarm cannot be simulated.
     """
     floor_plan(options.plan or _HALL)
     check_parameter_file(options.parameter_file)
@@ -147,8 +145,7 @@ def seen_from_above(swarm: Swarm) -> Swarm:
 def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
     """The swarm with a start for each robot; who has none stands where its world puts it, off the others.
 
-    Raises:
-        UserError: The world has no place for this number of robots.
+    Raises UserError if the world has no place for this number of robots.
     """
     described = [robot.start for robot in swarm.robots if robot.start is not None]
     if len(described) == len(swarm.robots):
@@ -282,11 +279,7 @@ def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: 
 
 
 def _check_pushbots(swarm: Swarm) -> None:
-    """Make sure that all robots have lights of their own.
-
-    Raises:
-        WorldError: There are too many robots.
-    """
+    """Make sure that all robots have lights of their own; raises WorldError if there are too many robots."""
     if len(swarm.robots) > MAX_ROBOTS:
         raise WorldError(
             f"{len(swarm.robots)} robots are more than the {MAX_ROBOTS} whose lights trackers can tell"

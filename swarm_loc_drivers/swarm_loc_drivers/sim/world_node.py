@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.parameters import ParameterError
 
 _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)
-_HELD_WAKE_S = 0.002
+_HELD_WAKE_S, _PATIENCE_S = 0.002, 10.0
 _MAX_LAG_S = 0.1  # A world that cannot keep up continues from now and does not catch up
 _QUIET_S, _FAREWELL_S = 0.5, MAX_STOP_S + 1.0
 """A world that is to stop goes on until no driver has been connected for so long, and at most so long [s].
@@ -44,6 +44,7 @@ class WorldNode(ConfiguredNode[Parameters]):
         self.host = FirmwareHost()
         self._steps = 0
         self._asked_s, self._used_s = math.inf, 0.0
+        self._held_since_s: float | None = None
 
     def serve(
         self,
@@ -57,11 +58,8 @@ class WorldNode(ConfiguredNode[Parameters]):
         """Put all robots on their links.
 
         `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a folder of links,
-        else a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first
-        one; 0: any.
-
-        Raises:
-            ParameterError: A link cannot be made.
+        else a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first one;
+        0: any. Raises ParameterError if a link cannot be made.
         """
         for robot, name in enumerate(names):
             firmware = firmware_of(robot)
@@ -91,9 +89,24 @@ class WorldNode(ConfiguredNode[Parameters]):
         """Advance the world by a step, and `publish_step`."""
         raise NotImplementedError
 
-    def is_held(self) -> bool:
-        """Whether simulated time is paused."""
+    def waits(self) -> bool:
+        """Whether simulated time waits for what another node has still to send; see `give_up`."""
         return False
+
+    def give_up(self) -> None:
+        """Wait no longer: nothing has come for `_PATIENCE_S` of real time."""
+
+    def _is_held(self) -> bool:
+        """Whether simulated time is paused."""
+        if not self.waits():
+            self._held_since_s = None
+            return False
+        now_s = time.monotonic()
+        self._held_since_s = self._held_since_s or now_s
+        if now_s > self._held_since_s + _PATIENCE_S:
+            self._held_since_s = None
+            self.give_up()
+        return True
 
     def publish_step(self, now_ns: int, poses: FloatArray) -> None:
         """Publish the time after a step, and at `truth_rate` the true poses (N, 3)."""
@@ -121,7 +134,7 @@ class WorldNode(ConfiguredNode[Parameters]):
             while (left_s := due_s - time.monotonic()) > 0.0:
                 self.host.poll(left_s)
             executor.spin_once(timeout_sec=0.0)
-            while self.is_held() and not stop.requested:
+            while self._is_held() and not stop.requested:
                 self.host.poll(0.0)
                 executor.spin_once(timeout_sec=_HELD_WAKE_S)
         executor.shutdown()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import UserError, number, text
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
@@ -71,7 +71,7 @@ class HiddenGeometry:
     scales: FloatArray  # (N,) reported distance per true distance
     landmarks: FloatArray  # (L, 3) in map
     faces: FloatArray  # (K, 3) in their robot's base_link
-    face_owner: NDArray[np.int64]  # (K,) robot index
+    face_owner: IntArray  # (K,) robot index
     ids: NDArray[np.uint32]  # (L + K,) marker ids
 
 
@@ -115,11 +115,7 @@ class LinkedWorldParameters(WorldParameters):
 
 
 def start_of(robot: Robot) -> Pose2:
-    """The start pose of a robot.
-
-    Raises:
-        WorldError: The swarm description has none.
-    """
+    """The start pose of a robot; raises WorldError if the swarm description has none."""
     if robot.start is None:
         raise WorldError(f"robot '{robot.name}' has no start pose, and a simulated robot needs one.")
     return robot.start

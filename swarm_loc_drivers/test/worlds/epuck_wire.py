@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import SessionError
-from swarm_loc_drivers.epuck.driver import WheelOdometry
-from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckModel, EpuckSession, Reading
+from swarm_loc_drivers.epuck.driver import EpuckSession, WheelOdometry
+from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckModel, Reading
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession

@@ -72,10 +72,8 @@ class Dialog:
     def answer(self, name: str, default: str, read: Callable[[str], Answer], choice: str = "") -> Answer:
         """The answer to the question `name` of `QUESTIONS`, which `choice` explains; Enter takes the default.
 
-        `read` converts an answer, and raises ArgumentTypeError with what is allowed.
-
-        Raises:
-            UserError: An option cannot be used, or standard input has ended.
+        `read` converts an answer, and raises ArgumentTypeError with what is allowed. Raises UserError if an
+        option cannot be used, or standard input has ended.
         """
         text = self._given.pop(name, None)
         if text is not None or not self._asks:

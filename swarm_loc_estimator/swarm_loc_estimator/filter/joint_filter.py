@@ -99,8 +99,7 @@ class JointFilter(Protocol):
 def inverse(matrix: FloatArray) -> FloatArray:
     """Inverse (n, n) of a symmetric positive definite matrix; exactly symmetric.
 
-    Raises:
-        LinAlgError: The matrix is not positive definite.
+    Raises LinAlgError if the matrix is not positive definite.
     """
     inverted: FloatArray = matrix.copy()
     invert(inverted)

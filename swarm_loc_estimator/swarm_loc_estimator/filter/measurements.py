@@ -14,8 +14,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
-NOBODY = -1
-"""Index of the observer of an absolute fix, of the target of a landmark sighting, of no landmark."""
+NOBODY = -1  # Index of the observer of an absolute fix, of the target of a landmark sighting, of no landmark
 
 Rows = TypeVar("Rows", bound="tuple[Any, ...]")
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import composed, factor_numbers, wrap
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
@@ -224,7 +224,7 @@ def register(model: MeasurementModel) -> None:
     MODELS[model.number] = model
 
 
-def is_compiled(models: np.typing.NDArray[np.int64]) -> BoolArray:
+def is_compiled(models: IntArray) -> BoolArray:
     """Whether compiled code evaluates measurements of models (m,)."""
     return np.isin(models, COMPILED)
 
@@ -288,7 +288,7 @@ def predict_any(
     return value, *sides, jacobian[:, :, 3:]
 
 
-def angles(models: np.typing.NDArray[np.int64]) -> BoolArray:
+def angles(models: IntArray) -> BoolArray:
     """Which components (m, 3) of measurements of models (m,) are angles."""
     found = np.zeros((models.size, 3), dtype=bool)
     for number in np.unique(models).tolist():

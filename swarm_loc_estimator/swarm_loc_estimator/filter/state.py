@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -270,28 +269,28 @@ class SwarmState:
         self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
         self._set_described_priors()
         # (N,) instant to which the robot is predicted, and what its track has preintegrated then (N, 3, 3)
-        self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
+        self.predicted_to_ns: IntArray = np.zeros(robots, dtype=np.int64)
         self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
         self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
         # (N,) whether the robot is part of the estimate, or may still begin at its configured start
-        self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
-        self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
+        self.tracked: BoolArray = np.zeros(robots, dtype=bool)
+        self.start_pending: BoolArray = np.ones(robots, dtype=bool)
         # (N,) stamp of the newest accepted landmark sighting or absolute fix
-        self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.last_fix_ns: IntArray = np.full(robots, NEVER_NS)
         self.sources = new_sources(robots, landmarks)
         # (N + L,) last contradiction of each robot and landmark, or of the whole description, see
         # `augment_all`
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
         self.is_doubted = False
         # (N, pairs) robots observed by each one, -1: none, when, and the mean, see `correlated_noise.py`
-        self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
-        self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
+        self.pair_robot: IntArray = np.full((robots, pairs), -1)
+        self.pair_stamp_ns: IntArray = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
         # Measurements (of `window.Window`) by robot that is not tracked, and whether they are of one degree
         # of freedom, see `initializer.py`; (N, 2) earliest instant of the next attempt to initialize it with
         # them
         self.windows: dict[tuple[int, bool], Any] = {}
-        self.next_attempt_ns: NDArray[np.int64] = np.full((robots, 2), NEVER_NS)
+        self.next_attempt_ns: IntArray = np.full((robots, 2), NEVER_NS)
         self.images: IdentityMemory | None = None  # None before the first aerial image
         self.delays: dict[int, Any] = {}  # Of lidars, by robot, of `mapping.messages.DelayBelief`
         self.map: Any = None  # Of lidars, of `map_search.SearchMap`; None: there is none yet
@@ -524,7 +523,7 @@ class SwarmState:
         return int(self._table.survey_column[landmark])
 
 
-def robot_columns(robots: NDArray[np.int64]) -> IntArray:
+def robot_columns(robots: IntArray) -> IntArray:
     """Filter columns (k, 3) of robots (k,)."""
     columns: IntArray = 3 * robots[:, None] + np.arange(3)
     return columns

@@ -29,7 +29,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.common.numerics import direction_of, wrap
 from swarm_loc_estimator.swarm.ir_board import (
@@ -324,7 +324,7 @@ class StartWorkspace(NamedTuple):
     """Memory for the search for starts."""
 
     misfit: Float32Array  # (D * D,)
-    level: NDArray[np.int64]  # (D * D,) the range of each direction
+    level: IntArray  # (D * D,) the range of each direction
     totals: Float32Array  # (L,)
     costs: Float32Array  # (D * D, L) of every pose, where readings may be too bright
 

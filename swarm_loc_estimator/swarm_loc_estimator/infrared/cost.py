@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.infrared.brightness import WAY_ROWS, predict_brightness
 from swarm_loc_estimator.swarm.ir_board import IrModel, ReadingErrors
@@ -129,8 +129,8 @@ class Costs(NamedTuple):
     # (F,) maximum residual, expected minus read [sigma]; beyond it the reading counts as blocked
     most: FloatArray
     # (F,) indices of readings evaluated by `reading_cost`; the first `counts[1]` are valid
-    others: NDArray[np.int64]
-    counts: NDArray[np.int64]  # (2,) number of Gaussian readings and of `others`
+    others: IntArray
+    counts: IntArray  # (2,) number of Gaussian readings and of `others`
 
 
 @cached_njit

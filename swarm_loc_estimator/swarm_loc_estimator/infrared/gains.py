@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -44,8 +43,8 @@ _MIN_SIGMA = 0.003  # Minimum reported standard deviation of gains
 class Exchanges(NamedTuple):
     """Readings of robots of each other."""
 
-    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
-    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    receiver: IntArray  # (k,) index of the robot that measured
+    transmitter: IntArray  # (k,) index of the robot that lit its emitters
     readings: FloatArray  # (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured
     saturation: FloatArray  # (k, modes) minimum of saturated readings [count]
     # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where not known
@@ -59,7 +58,7 @@ class GainsFit:
     # One per robot; the uncalibrated default where contradictory exchanges would make the estimate less
     # certain than that
     gains: tuple[IrGains, ...]
-    used: NDArray[np.bool_]  # (k,) which exchanges were used
+    used: BoolArray  # (k,) which exchanges were used
     # (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used
     before: FloatArray
     after: FloatArray  # (k, modes, n, n) those residuals with the gains
@@ -74,10 +73,8 @@ def estimate_gains(
 ) -> GainsFit:
     """Estimate the gains of all robots; `element_sigma` of the platform is their prior standard deviation.
 
-    `progress` is called with the name of each step.
-
-    Raises:
-        GainsError: `element_sigma` is 0, the platform's curves do not hold, or no exchange can be used.
+    `progress` is called with the name of each step. Raises GainsError if `element_sigma` is 0, the platform's
+    curves do not hold, or no exchange can be used.
     """
     if platform.element_sigma == 0.0:
         raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")
@@ -115,7 +112,7 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
 
 def _poses(
     estimator: MaximumLikelihood, exchanges: Exchanges, pairs: PairGains
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """The pose (k, 3) of every exchange, and which are reliable; raises GainsError if none is.
 
     Known poses are combined with the readings, since robots may have moved during the exchange.
@@ -142,7 +139,7 @@ def _apart(poses: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _residuals(
-    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: BoolArray
 ) -> FloatArray:
     """Residuals (k, modes, n, n) [sigma]; NaN where not used."""
     linear = _linearized(platform, exchanges, logs, poses, used)
@@ -161,7 +158,7 @@ class _Linear(NamedTuple):
 
 
 def _linearized(
-    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: BoolArray
 ) -> _Linear:
     pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
     expected, slopes = expected_with_slopes(platform, poses[used], pairs)
@@ -176,7 +173,7 @@ def _linearized(
 
 
 def _improved(
-    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: BoolArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """One Gauss-Newton step: log-gains, two covariances (2, P, P), and the largest change.
 
@@ -252,7 +249,7 @@ def _as_gains(
     exchanges: Exchanges,
     logs: FloatArray,
     covariances: FloatArray,
-    used: NDArray[np.bool_],
+    used: BoolArray,
 ) -> tuple[IrGains, ...]:
     """Gains with standard deviations from the larger of the covariances (2, P, P); see `GainsFit`."""
     unseen = platform.element_sigma**2 / platform.n

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import assign_matrix, wrap
 from swarm_loc_estimator.infrared import brightness
@@ -51,7 +51,7 @@ class IrSolutions(NamedTuple):
 
     poses: FloatArray  # (k, 3)
     covariances: FloatArray  # (k, 3, 3)
-    outcomes: NDArray[np.int64]  # (k,) of `IrOutcome`
+    outcomes: IntArray  # (k,) of `IrOutcome`
     alternatives: FloatArray  # (k, 3) the second-best pose where it is nearly as likely, else NaN
     odds: FloatArray  # (k,) its likelihood relative to the best one's, in [0, 1]
     # (k, 3) share of each variance that is systematic, mostly from unknown gains
@@ -79,8 +79,7 @@ def checked(
 ) -> tuple[FloatArray, PairGains, FloatArray]:
     """Validate readings (k, modes, n, n), gains and saturation (k, modes), and fill in defaults.
 
-    Raises:
-        ReadingsError: They have another shape.
+    Raises ReadingsError if they have another shape.
     """
     values = np.ascontiguousarray(readings, dtype=np.float64)
     wanted = (len(platform.amplitudes), platform.n, platform.n)

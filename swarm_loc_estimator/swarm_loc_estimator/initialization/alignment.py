@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import numerics, se2
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
@@ -304,9 +304,7 @@ def _turn_off(constraint: Constraint, heading: float) -> float:
 
 
 @cached_njit
-def _vote(
-    constraints: ConstraintArray, transforms: FloatArray
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _vote(constraints: ConstraintArray, transforms: FloatArray) -> tuple[IntArray, IntArray]:
     """Number of constraints that agree with each transform (h, 3), and of their points and headings."""
     count = transforms.shape[0]
     agreeing, support = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)

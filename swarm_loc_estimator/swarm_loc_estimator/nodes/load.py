@@ -16,9 +16,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.inputs import SENSORS, Batch
 from swarm_loc_estimator.sensors.sensor import Sensor
@@ -83,7 +82,7 @@ class Thinning:
         measurements = {sensor.name: one.robot.size for sensor, one in zip(self._sensors, units, strict=True)}
         return Thinned(left, measurements, sum(shed.values()))
 
-    def _used(self, source: IntArray, share: float) -> NDArray[np.bool_]:
+    def _used(self, source: IntArray, share: float) -> BoolArray:
         """Select measurements (u,) by their sources (u,)."""
         count = np.bincount(source, minlength=self._number.size)
         order = np.argsort(source, kind="stable")

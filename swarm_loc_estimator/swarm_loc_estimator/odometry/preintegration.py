@@ -13,9 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import add_scaled, assign, assign_matrix, wrap
 from swarm_loc_estimator.odometry.track_arrays import (
@@ -279,7 +278,7 @@ class NewRows(NamedTuple):
     stamp_ns: IntArray  # (k,) instants, calibrated for delay
     raw: FloatArray  # (k, 3) poses as reported
     twist: FloatArray  # (k, 3) twists as reported
-    new: NDArray[np.bool_]  # (k,) False for rows that are integrated again
+    new: BoolArray  # (k,) False for rows that are integrated again
 
 
 class Integrated(NamedTuple):

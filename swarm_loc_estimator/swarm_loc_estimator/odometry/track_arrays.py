@@ -44,8 +44,7 @@ continued from row to row."""
 CHECKS = 13  # Number of these values
 
 _MEMORY_S, _RATIO_MEMORY_S = 1.2, 10.0
-COVER_NS = round(1e9 * _MEMORY_S)
-"""Time for which turns before a contradiction are uncertain."""
+COVER_NS = round(1e9 * _MEMORY_S)  # Time for which turns before a contradiction are uncertain
 _PATIENCE_S, _NEW_PATIENCE_S = 3.0, 0.5  # The second one before the gyroscope has agreed
 _FIRST_STEPS, _MOST_STEPS = 8.0, 200.0  # Weight of the described noise in steps, and memory of the noise
 _MOST_NOISE = 100.0  # Largest measured noise of a step, in described ones

@@ -138,10 +138,8 @@ _MAP = "map"
 def write_mcap(result: ReplayResult, path: Path) -> None:
     """Write the file, replacing an existing one.
 
-    Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames.
-
-    Raises:
-        UserError: It cannot be written.
+    Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames. Raises UserError
+    if it cannot be written.
     """
     with naming(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,6 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from domain_coordinator import domain_id
-from numpy.typing import NDArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -27,7 +26,7 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launch import (
     Child,
@@ -65,10 +64,8 @@ class LiveError(UserError):
 class LiveGraph:
     """A graph that runs as child processes while this process listens; use it as a context manager.
 
-    The estimator is the first node; the others start when this process has discovered its poses.
-
-    Raises:
-        LiveError: The estimator does not start.
+    The estimator is the first node; the others start when this process has discovered its poses. Raises
+    LiveError if the estimator does not start.
     """
 
     recorder: Recorder  # Records poses and diagnostics
@@ -124,10 +121,8 @@ class LiveGraph:
         """Process messages until a condition holds, which is checked after each event and every 50 ms.
 
         `what` is the condition in words, following "did not". The patience is since the last poses. All nodes
-        that have started, or those that are needed, must keep running.
-
-        Raises:
-            LiveError: A node has ended, or the timeout has passed.
+        that have started, or those that are needed, must keep running. Raises LiveError if a node has ended,
+        or the timeout has passed.
         """
         heard, since_s = -1, time.monotonic()
         while not condition():
@@ -278,7 +273,7 @@ class LiveRun:
     result: ReplayResult  # Poses as received, ground truth of the bag, counts of dropped inputs
     # Topic of the estimator's inputs -> (M,) increasing log times of its messages in the bag, all of which
     # were published
-    arrival_ns: Mapping[str, NDArray[np.int64]]
+    arrival_ns: Mapping[str, IntArray]
     # Stamp of poses -> topic -> messages that the estimator had received by then; of some poses
     taken: Mapping[int, Mapping[str, int]]
     rate: float  # Speed of the player
@@ -309,7 +304,7 @@ class BagContent:
     begin_ns: int  # First log time
     end_ns: int  # Last one
     # Topic of the estimator's inputs -> (M,) increasing log times of its messages
-    arrival_ns: Mapping[str, NDArray[np.int64]]
+    arrival_ns: Mapping[str, IntArray]
     truth: Mapping[str, Trajectory]  # Robot name -> ground truth
     remarks: tuple[str, ...]  # What could not be read, one sentence each
 
@@ -318,11 +313,7 @@ Watch = Callable[[Recorder, BagContent], None]
 
 
 def read_content(bag: Path, swarm: Swarm) -> BagContent:
-    """Read ground truth and arrival times of a bag.
-
-    Raises:
-        BagError: Nothing in the bag can be read.
-    """
+    """Read ground truth and arrival times of a bag; raises BagError if nothing in the bag can be read."""
     inputs = [topic.name for topic in input_topics(swarm)]
     with BagReader(bag) as reader:
         truth = TruthReader(swarm, reader.topics)

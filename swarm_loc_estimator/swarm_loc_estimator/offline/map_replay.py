@@ -48,10 +48,8 @@ def replay_map(
 
     The bag has `<robot>/odom`, `<robot>/laser` and, if frequencies of LEDs by robot [Hz] are given,
     `<robot>/lights`; of robots with a lidar `<robot>/scan`. `progress` is called now and then with the share
-    done and what is being done. `remap` is as in `renamed_topics`.
-
-    Raises:
-        UserError: The bag cannot be read, a topic cannot be mapped, or the robots cannot start.
+    done and what is being done. `remap` is as in `renamed_topics`. Raises UserError if the bag cannot be
+    read, a topic cannot be mapped, or the robots cannot start.
     """
     source = {
         f"{robot.name}/{kind.topic}": (k, kind)
@@ -114,21 +112,7 @@ def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], wall
 
     `walls` (S, 4) are segments x0, y0, x1, y1 of the floor plan [m], if any.
     """
-    off = _stop_errors(mapper, truth)
-    position = math.sqrt(np.mean(np.square(off[:, :2]).sum(axis=1))) if len(off) else math.nan
-    heading = math.sqrt(np.mean(np.square(off[:, 2]))) if len(off) else math.nan
-    occupancy = mapper.occupancy()
-    cells = occupancy.centres(occupancy.occupied)
-    if not len(walls) or not len(cells):
-        return MapFigures(len(off), position, heading, math.nan, math.nan)
-    points = _wall_points(walls)
-    wall = float(cKDTree(points).query(cells)[0].mean())
-    coverage = float((cKDTree(cells).query(points)[0] < COVERED_M).mean())
-    return MapFigures(len(off), position, heading, wall, coverage)
-
-
-def _stop_errors(mapper: CooperativeMapper, truth: Mapping[int, Trajectory]) -> FloatArray:
-    """Estimated minus true poses (n, 3) of the stops that have ground truth."""
+    # estimated minus true poses (n, 3) of the stops that have ground truth
     errors = [np.zeros((0, 3))]
     for stop, begin_ns in mapper.begin_ns.items():
         if (track := truth.get(int(mapper.graph.robot[stop]))) is not None:
@@ -136,17 +120,22 @@ def _stop_errors(mapper: CooperativeMapper, truth: Mapping[int, Trajectory]) -> 
             errors.append((mapper.graph.states[stop, :3] - pose)[known])
     off = np.concatenate(errors)
     off[:, 2] = wrap_angle(off[:, 2])
-    return off
-
-
-def _wall_points(walls: FloatArray) -> FloatArray:
-    """Points (p, 2) in the middle of equal pieces of walls (S, 4)."""
-    pieces = []
+    position = math.sqrt(np.mean(np.square(off[:, :2]).sum(axis=1))) if len(off) else math.nan
+    heading = math.sqrt(np.mean(np.square(off[:, 2]))) if len(off) else math.nan
+    # distances between occupied cells and walls
+    occupancy = mapper.occupancy()
+    cells = occupancy.centres(occupancy.occupied)
+    if not len(walls) or not len(cells):
+        return MapFigures(len(off), position, heading, math.nan, math.nan)
+    pieces = []  # points in the middle of equal pieces of walls
     for x0, y0, x1, y1 in walls:
         count = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0) / _SPACING_M))
         share = ((np.arange(count) + 0.5) / count)[:, None]
         pieces.append(np.array([x0, y0]) + share * np.array([x1 - x0, y1 - y0]))
-    return np.concatenate(pieces)
+    points = np.concatenate(pieces)
+    wall = float(cKDTree(points).query(cells)[0].mean())
+    coverage = float((cKDTree(cells).query(points)[0] < COVERED_M).mean())
+    return MapFigures(len(off), position, heading, wall, coverage)
 
 
 _WIDTH_IN = 9.0

@@ -150,11 +150,11 @@ def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
     return rmse, float(values.mean()), median, p95, float(values.max())
 
 
-def _alone(stamp_ns: IntArray, max_gap_ns: int) -> npt.NDArray[np.bool_]:
+def _alone(stamp_ns: IntArray, max_gap_ns: int) -> BoolArray:
     """(N,) whether a stamp is further than the gap from both neighbours."""
     far = np.diff(stamp_ns) > max_gap_ns
     ends = np.ones(1, np.bool_)
-    lonely: npt.NDArray[np.bool_] = np.concatenate([ends, far]) & np.concatenate([far, ends])
+    lonely: BoolArray = np.concatenate([ends, far]) & np.concatenate([far, ends])
     return lonely[: len(stamp_ns)]
 
 

@@ -70,18 +70,12 @@ def truth_topics(swarm: Swarm) -> list[str]:
 class BagLocalizer:
     """Turns messages of the localizer of a swarm into fixes or ground truth, as `localizer_bridge` does live.
 
-    Args:
-        swarm: Describes the localizer, or none.
-        recorded: Topics of the bag.
-
-    Attributes:
-        topics: Topics of the localizer that are recorded.
-        outputs: Topics of the robots that it locates.
+    The swarm describes the localizer, or none; `recorded` are the topics of the bag.
     """
 
     def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
-        self.topics: list[str] = []
-        self.outputs: dict[str, BagTopic] = {}
+        self.topics: list[str] = []  # Topics of the localizer that are recorded
+        self.outputs: dict[str, BagTopic] = {}  # Topics of the robots that it locates
         self._missing: list[str] = []
         self._health = Health(lambda _: None)
         if (localizer := swarm.localizer) is None:
@@ -271,10 +265,8 @@ def read_bag(
     """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
     `take` is called with the inputs, in order of arrival, less those that `loss` drops; ground truth, maps
-    and goals are complete. `remap` is as in `renamed_topics`.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    and goals are complete. `remap` is as in `renamed_topics`. Raises BagError if nothing in the bag can be
+    read, or a topic cannot be mapped.
     """
     ingest, maps = Ingest(swarm), MapReader(swarm)
     network = Network(loss, [*ingest.handle_of])
@@ -323,10 +315,8 @@ def mounts_of_bag(
 ) -> Mounts:
     """Mounts of sensors by the static transforms of a bag; `remap` as in `renamed_topics`.
 
-    `heard` are topics that may be mapped beside those of the estimator.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    `heard` are topics that may be mapped beside those of the estimator. Raises BagError if nothing in the bag
+    can be read, or a topic cannot be mapped.
     """
     mounts = Mounts(swarm)
     known = [*Ingest(swarm).handle_of, *truth_topics(swarm), *MapReader(swarm).topics, *heard]
@@ -357,10 +347,8 @@ def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str
     """Topic of a bag -> the topic as which it is read, by rules expected topic -> topic of the bag.
 
     An example is robot1/odom -> /robot1/odometry/filtered; `<robot>` in both stands for each robot. `known`
-    are the expected topics.
-
-    Raises:
-        BagError: An expected topic is unknown, or two of them have the same topic of the bag.
+    are the expected topics. Raises BagError if an expected topic is unknown, or two of them have the same
+    topic of the bag.
     """
     renamed: dict[str, str] = {}
     for own, stored in remap.items():

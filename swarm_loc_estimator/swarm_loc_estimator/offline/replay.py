@@ -14,7 +14,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
@@ -55,7 +54,7 @@ def replay(
     settings: Settings | None = None,
     *,
     tick_s: float = TICK_S,
-    stamp_ns: npt.NDArray[np.int64] | None = None,
+    stamp_ns: IntArray | None = None,
     remap: Mapping[str, str] = MappingProxyType({}),
     loss: Loss = NOTHING_LOST,
     truth: Mapping[str, Trajectory] = MappingProxyType({}),
@@ -160,7 +159,7 @@ _MAX_LOSSES = 100_000
 class ListedSchedule:
     """Outputs at given times (T,) [ns], increasing."""
 
-    def __init__(self, stamp_ns: npt.NDArray[np.int64]) -> None:
+    def __init__(self, stamp_ns: IntArray) -> None:
         self.jumps = 0  # Number of forward jumps of the clock by more than `MAX_PAUSE_NS`
         self._stamp_ns = stamp_ns
         self._done = 0

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.files import naming
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.trajectory import Trajectory
@@ -101,12 +101,12 @@ class ReplayResult:
 
     title: str  #: Such as the name of the bag
     swarm: Swarm  #: Robots and landmarks
-    stamp_ns: npt.NDArray[np.int64]  #: (T,) times of the poses
+    stamp_ns: IntArray  #: (T,) times of the poses
     #: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot is not located
-    poses: npt.NDArray[np.float64]
-    covariances: npt.NDArray[np.float64]  #: (T, N, 3, 3) of x, y, theta
+    poses: FloatArray
+    covariances: FloatArray  #: (T, N, 3, 3) of x, y, theta
     status: npt.NDArray[np.uint8]  #: (T, N) of `Status`
-    heading_known: npt.NDArray[np.bool_] = field(kw_only=True)  #: (T, N) whether the heading is known, too
+    heading_known: BoolArray = field(kw_only=True)  #: (T, N) whether the heading is known, too
     #: Robot name -> ground truth; robots without are missing
     truth: Mapping[str, Trajectory] = field(default_factory=dict)
     #: Counts by name, such as dropped inputs by reason
@@ -124,7 +124,7 @@ class ReplayResult:
     #: Robot name -> its recorded goals; robots without are missing
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
     #: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty: never
-    is_local: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    is_local: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     #: The same with poses smoothed by the whole recording; None: not asked for
     smoothed: ReplayResult | None = None
     losses: tuple[LossReport, ...] = ()  #: Losses of robots, as known at the stamps; robot by robot
@@ -151,7 +151,7 @@ class ReplayResult:
         more = len(found) - _MAX_LOST
         return [*remarks, f"{more} more robots were lost."] if more > 0 else remarks
 
-    def select(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
+    def select(self, rows: BoolArray) -> ReplayResult:
         """The result with only the poses at some of the stamps (T,)."""
         names = ["stamp_ns", "poses", "covariances", "status", "heading_known"]
         names += ["is_local"] * bool(self.is_local.size)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS
@@ -197,7 +197,7 @@ class Cameras(NamedTuple):
     """
 
     robots: int
-    present: NDArray[np.bool_]
+    present: BoolArray
     mount: FloatArray
     height: FloatArray
     level: FloatArray
@@ -218,7 +218,7 @@ class Markers(NamedTuple):
     pose: FloatArray
     height: FloatArray
     size: FloatArray
-    lies: NDArray[np.bool_]
+    lies: BoolArray
     variance: FloatArray
 
 

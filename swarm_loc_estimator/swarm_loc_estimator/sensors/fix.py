@@ -7,9 +7,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_FIXES
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import HEADING_UNKNOWN, decode_fix
@@ -41,13 +40,13 @@ class FixRows(NamedTuple):
 NO_FIXES = FixRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)
 
 
-def is_unknown(covariance: FloatArray) -> NDArray[np.bool_]:
+def is_unknown(covariance: FloatArray) -> BoolArray:
     """Whether covariances (f, 3, 3) are unset (f,): zeros, or -1 in the first element, as in ROS."""
     first = covariance[:, 0, 0]
     return np.asarray(((first == 0.0) | (first == -1.0)) & (covariance[:, 1, 1] == 0.0))
 
 
-def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
+def has_heading(covariance: FloatArray) -> BoolArray:
     """Whether fixes with covariances (f, 3, 3) may include a heading (f,)."""
     known = (covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN)
     return np.asarray(known | is_unknown(covariance))
@@ -71,7 +70,7 @@ def about_robots(
     return out
 
 
-def take_out_headings(measurements: Measurements, without: NDArray[np.bool_]) -> None:
+def take_out_headings(measurements: Measurements, without: BoolArray) -> None:
     """Remove the headings of those measurements (m,) selected by `without` (m,)."""
     measurements.has_heading[without], measurements.value[without, 2] = False, 0.0
     covariance = measurements.covariance
@@ -122,7 +121,7 @@ class FixSensor(Sensor):
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         return fixes
 
-    def _described(self, rows: FixRows, unknown: NDArray[np.bool_]) -> FixRows:
+    def _described(self, rows: FixRows, unknown: BoolArray) -> FixRows:
         """Fill in covariances that are not known from the swarm description."""
         pose, covariance = rows.pose.copy(), rows.covariance.copy()
         covariance[unknown] = self._default[rows.robot[unknown]]

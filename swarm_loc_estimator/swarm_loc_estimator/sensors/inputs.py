@@ -111,10 +111,8 @@ class InputTopic:
 def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm.
 
-    With `maps` also those that are of use to a mapper, or in a map that is not described.
-
-    Raises:
-        UserError: `Swarm.topics` has a topic that is not read, or two topics are the same.
+    With `maps` also those that are of use to a mapper, or in a map that is not described. Raises UserError if
+    `Swarm.topics` has a topic that is not read, or two topics are the same.
     """
     known = {kind.topic for kind in kinds().values() if kind.of_each} | {TRUTH}
     if unknown := [key for key in swarm.topics if key.partition("/")[2] not in known]:
@@ -208,10 +206,8 @@ class Batch:
         """Create a batch from columns by sensor, see `Estimator.step`.
 
         Nothing arrives before `begin_ns`; readings without `arrival_ns` arrive at their stamps, but not after
-        `now_ns`.
-
-        Raises:
-            TypeError: There is no such sensor, robot or column, or a column has another length or shape.
+        `now_ns`. Raises TypeError if there is no such sensor, robot or column, or a column has another length
+        or shape.
         """
         rows = {}
         for name, given in readings.items():
@@ -334,7 +330,7 @@ MAX_PAUSE_NS = 3_600_000_000_000
 
 CLOCKS_APART_S = 0.2  # Difference between the clock of a robot and those of the others that is named [s]
 
-_OF_MESSAGES = ("received", "malformed", "last_stamp_ns", "first_arrival_ns", "last_arrival_ns")
+_OF_MESSAGES = ("received", "malformed", "first_arrival_ns", "last_arrival_ns")
 _LATE = ("late_sum_ns", "late_min_ns", "late_max_ns", "late_count")
 # as floats, since a sum of absurd delays exceeds int64
 _TYPES = {"late_sum_ns": np.float64}
@@ -356,11 +352,6 @@ class InputStatistics:
     def malformed(self) -> int:
         """Number of malformed messages."""
         return int(self._row["malformed"][0])
-
-    @property
-    def last_stamp_ns(self) -> int | None:
-        """Stamp of the newest valid message; None before the first."""
-        return int(self._row["last_stamp_ns"][0]) if self.received > self.malformed else None
 
     @property
     def last_arrival_ns(self) -> int | None:
@@ -530,7 +521,7 @@ def _count(
         if one.received - one.malformed == 1:
             one.first_arrival_ns = arrival_ns[k]
         late_ns = arrival_ns[k] - stamp_ns[k]
-        one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
+        one.last_arrival_ns = arrival_ns[k]
         one.late_min_ns = min(one.late_min_ns, late_ns) if one.late_count else late_ns
         one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns
         one.late_sum_ns += late_ns

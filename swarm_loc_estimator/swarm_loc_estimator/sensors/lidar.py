@@ -29,22 +29,15 @@ class ScanRows(NamedTuple):
 
 
 class SweepStore:
-    """Keeps sweeps until they are fused, and measurements that stand for them.
+    """Keeps sweeps of a swarm's lidars until they are fused, and measurements that stand for them.
 
     The stamp of a measurement is the time of its last beam, so all odometry during the sweep is before it.
-
-    Args:
-        swarm: Robots with their lidars.
-
-    Attributes:
-        drops: None; scans that cannot be used are counted by the sensor.
-        sweeps: LidarSweep by robot and stamp of its first beam [ns].
     """
 
     def __init__(self, swarm: Swarm) -> None:
         self._late_ns = np.array([round(-1e9 * min(0.0, one.lidar.delay_s)) for one in swarm.robots])
-        self.drops: Counter[str] = Counter()
-        self.sweeps: dict[tuple[int, int], LidarSweep] = {}
+        self.drops: Counter[str] = Counter()  # None: scans that cannot be used are counted by the sensor
+        self.sweeps: dict[tuple[int, int], LidarSweep] = {}  # By robot and stamp of the first beam [ns]
 
     @property
     def counters(self) -> dict[str, int]:

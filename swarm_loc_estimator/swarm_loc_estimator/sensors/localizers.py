@@ -135,8 +135,7 @@ class _UnusableError(Exception):
 class LocalizedRobots:
     """Converts poses of bodies to poses of robots; what was dropped and seen goes to `health`.
 
-    Raises:
-        ParameterError: A parameter cannot be used.
+    Raises ParameterError if a parameter cannot be used.
     """
 
     def __init__(self, parameters: Localizer, robots: Collection[str], health: Health) -> None:

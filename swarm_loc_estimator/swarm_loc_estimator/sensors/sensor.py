@@ -42,8 +42,7 @@ def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
 def fill(column: NDArray[Any], given: Any, name: str) -> None:
     """Write given values to a column (k, ...); a number stands for all.
 
-    Raises:
-        TypeError: They have another length or shape, or are no numbers that the column can hold.
+    Raises TypeError if they have another length or shape, or are no numbers that the column can hold.
     """
     try:
         if column.dtype == object:
@@ -456,7 +455,7 @@ class SharedColumns(NamedTuple):
     """Decoded messages (n,) with readings of many robots."""
 
     stamp_ns: IntArray  # (n,) stamps of the messages
-    valid: NDArray[np.bool_]  # (n,) True if the message is complete and of the right type
+    valid: BoolArray  # (n,) True if the message is complete and of the right type
     rows: Any  # The readings
     dropped: Mapping[str, int]  # Number of unusable readings of valid messages by reason
 

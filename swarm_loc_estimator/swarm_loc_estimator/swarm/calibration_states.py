@@ -17,7 +17,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import compose, error_covariance
@@ -54,11 +53,11 @@ _MIN_SURVEY_SIGMA = 1e-4  # Minimum of an estimated landmark [m, rad], so that i
 class ParameterTable(NamedTuple):
     """Table of estimated parameters of robots and landmarks, for compiled code."""
 
-    column: NDArray[np.int64]  # (N, PARAMETERS) filter column; -1: not estimated, value 0
+    column: IntArray  # (N, PARAMETERS) filter column; -1: not estimated, value 0
     sigma: FloatArray  # (N, PARAMETERS) prior standard deviation; 0: never estimated
     time_s: FloatArray  # (N, PARAMETERS) time constants of parameters that vary; infinite for constant ones
     # (L,) first of the three filter columns of each landmark; -1: not estimated
-    survey_column: NDArray[np.int64]
+    survey_column: IntArray
     survey: FloatArray  # (L, 3, 3) prior covariance of its error
     shared: FloatArray  # (L, 3, 4) its error by one standard deviation of each error that all share
     reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction

@@ -67,8 +67,7 @@ class PowerPiece:
 class PowerCurve:
     """A symmetric curve in pieces, such as eqs (19) and (20) of the Droplet paper.
 
-    Raises:
-        IrPlatformError: Pieces do not ascend to pi, do not meet, or are not finite and positive.
+    Raises IrPlatformError if pieces do not ascend to pi, do not meet, or are not finite and positive.
     """
 
     pieces: tuple[PowerPiece, ...]
@@ -101,8 +100,7 @@ class PowerCurve:
 class TabulatedCurve:
     """A curve given at angles, interpolated without overshoot; it need not be symmetric.
 
-    Raises:
-        IrPlatformError: Sizes do not fit, angles do not ascend, or values are not finite and positive.
+    Raises IrPlatformError if sizes do not fit, angles do not ascend, or values are not finite and positive.
     """
 
     # (K,) ascending within [-pi, pi] [rad]; the curve is constant beyond the first and last
@@ -246,8 +244,7 @@ class IrModel(NamedTuple):
 class IrPlatform:
     """An infrared board.
 
-    Raises:
-        IrPlatformError: A number is out of range, elements coincide, or dark_level reaches saturation.
+    Raises IrPlatformError if a number is out of range, elements coincide, or dark_level reaches saturation.
     """
 
     # (n,) directions of the elements in base_link [rad], counter-clockwise positive
@@ -324,8 +321,7 @@ class IrPlatform:
 class IrGains:
     """Gains of one robot's elements relative to its platform.
 
-    Raises:
-        IrPlatformError: A factor is not in [0.05, 20], sizes differ, or an element does not exist.
+    Raises IrPlatformError if a factor is not in [0.05, 20], sizes differ, or an element does not exist.
     """
 
     sensor: tuple[float, ...] = field(metadata=entry(_GAINS))  # (n,) factors of the sensors [1]

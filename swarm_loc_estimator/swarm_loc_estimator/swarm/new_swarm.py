@@ -293,8 +293,7 @@ class SwarmPlan:
 def planned_swarm(plan: SwarmPlan) -> Swarm:
     """The swarm of a plan; start poses are unknown, and landmarks stand at the height of the cameras.
 
-    Raises:
-        PlanError: The family has too few ids.
+    Raises PlanError if the family has too few ids.
     """
     known, sensors = plan.known, plan.sensors
     # places and ids of all markers

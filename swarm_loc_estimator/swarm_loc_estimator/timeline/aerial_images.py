@@ -12,7 +12,7 @@ from collections import Counter
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF, is_contradicted
@@ -168,7 +168,7 @@ class PictureFusion:
         self,
         state: SwarmState,
         image: Measurements,
-        looking: np.typing.NDArray[np.bool_],
+        looking: BoolArray,
         claims: dict[int, Identity],
         taken: Counter[int],
     ) -> None:

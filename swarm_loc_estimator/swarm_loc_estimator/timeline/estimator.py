@@ -228,8 +228,7 @@ class Estimator:
     def use_map(self, stamp_ns: int, drawn: OccupancyMap) -> None:
         """Replace the map of lidars from an instant on; located robots stay, others are searched in it.
 
-        Raises:
-            MapFileError: It has no walls, or no free space.
+        Raises MapFileError if it has no walls, or no free space.
         """
         if self._origin is None:
             self._origin = local_origin.local_origin(drawn.corner[None])

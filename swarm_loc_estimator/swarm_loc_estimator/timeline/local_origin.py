@@ -33,8 +33,7 @@ def local_origin(places: FloatArray) -> FloatArray:
 def described_origin(swarm: Swarm) -> FloatArray:
     """The local origin (2,) of a swarm by what it says of places in `map` [m].
 
-    Raises:
-        UserError: Its map is needed for that and cannot be read.
+    Raises UserError if its map is needed for that and cannot be read.
     """
     places: list[Any] = [robot.start[:2] for robot in swarm.robots if robot.start is not None]
     places += [(one.x, one.y) for one in swarm.surveyed]

@@ -105,8 +105,7 @@ class Match(NamedTuple):
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
     """Prepare a map for matching; its file is for errors.
 
-    Raises:
-        MapFileError: No cell is occupied, or none is free.
+    Raises MapFileError if no cell is occupied, or none is free.
     """
     occupied, free, cell = occupancy.occupied, occupancy.free, occupancy.cell
     for what, some in (("occupied", occupied), ("free", free)):
@@ -126,7 +125,7 @@ def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
 
 
 @cached_njit
-def _lines(surface: NDArray[np.bool_], cells: IntArray, window: int) -> tuple[FloatArray, FloatArray]:
+def _lines(surface: BoolArray, cells: IntArray, window: int) -> tuple[FloatArray, FloatArray]:
     """Lines (w, 4) at wall cells (w, 2) and variances (w,) of their normals, in units of cells."""
     line, normal_variance = np.zeros((len(cells), 4)), np.zeros(len(cells))
     for k in range(len(cells)):

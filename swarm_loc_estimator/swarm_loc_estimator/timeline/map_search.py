@@ -159,8 +159,7 @@ def placed_map(drawn: OccupancyMap, origin: FloatArray, path: Path = Path(MAP_BY
 def described_map(swarm: Swarm) -> SearchMap | None:
     """Read the map of a swarm, if it has a file, and compile what uses maps before data come.
 
-    Raises:
-        UserError: The map cannot be read, or has no walls or no free space.
+    Raises UserError if the map cannot be read, or has no walls or no free space.
     """
     if swarm.map is None:
         return None

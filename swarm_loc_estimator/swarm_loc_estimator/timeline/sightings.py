@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import SWARM_SIGHTINGS, CdrError, decode, encode, nanoseconds
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
 
@@ -18,7 +19,7 @@ class Recent(NamedTuple):
 
     measurements: Measurements  # (m,) sorted by stamp
     verdicts: NDArray[np.uint8]  # (m,) of `Verdict`
-    nis: NDArray[np.float64]  # (m,) normalized innovation squared
+    nis: FloatArray  # (m,) normalized innovation squared
 
 
 class Sightings(NamedTuple):
@@ -68,8 +69,7 @@ def encode_sightings(frame_id: str, stamp_ns: int, sightings: Sightings) -> byte
 def decode_sightings(data: bytes) -> tuple[int, Sightings]:
     """Stamp [ns] and columns of a serialized SwarmSightings.
 
-    Raises:
-        CdrError: The message is incomplete, or its columns differ in length.
+    Raises CdrError if the message is incomplete, or its columns differ in length.
     """
     message = decode(data, SWARM_SIGHTINGS)
     header, *columns = vars(message).values()

@@ -296,7 +296,7 @@ class Timeline:
         self._commands: list[Command] = []
         self._redo_from_ns: int | None = None
         self.buffer = MeasurementBuffer()  # Measurements within the horizon
-        self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
+        self.settled: IntArray = np.zeros(len(Verdict), dtype=np.int64)
         self.duplicates = 0
         self.too_old = 0
 
@@ -326,7 +326,7 @@ class Timeline:
         due_ns += [one.stamp_ns for one in self._commands if one.stamp_ns > self._head_key]
         return min(due_ns)
 
-    def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
+    def invalidate(self, changed_from_ns: IntArray) -> None:
         """Mark steps of robots whose tracks have changed after an instant (N,) to be computed again."""
         stamp_ns = self.buffer.stamp_ns
         first = _first_touched(stamp_ns, *self.buffer.sides, changed_from_ns, self._fusion_period_ns)
@@ -337,7 +337,7 @@ class Timeline:
                 self._redo_from(command.stamp_ns)
                 break
 
-    def verdict_counts(self) -> NDArray[np.int64]:
+    def verdict_counts(self) -> IntArray:
         """Number of measurements by verdict (len(Verdict),) since the last restart."""
         return self.settled + np.bincount(self.buffer.verdicts, minlength=len(Verdict))
 
@@ -457,10 +457,10 @@ class Timeline:
 
 @cached_njit
 def _first_touched(
-    stamps_ns: NDArray[np.int64],
-    observers: NDArray[np.int64],
-    targets: NDArray[np.int64],
-    changed_from_ns: NDArray[np.int64],
+    stamps_ns: IntArray,
+    observers: IntArray,
+    targets: IntArray,
+    changed_from_ns: IntArray,
     period_ns: int,
 ) -> int:
     """First measurement (of m, by stamp) of a robot whose track (of N) changed before it; m if none.

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.messages.cdr import MARKERS, encode
@@ -128,6 +127,6 @@ def ellipses(pose: FloatArray, covariance: FloatArray) -> FloatArray:
     circle = np.stack([np.cos(turn), np.sin(turn)])
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])
     axes = vectors * np.sqrt(_CHI2_95 * np.maximum(values, 0.0))[:, None, :]
-    around: NDArray[np.float64] = pose[:, :2, None] + axes @ circle
+    around: FloatArray = pose[:, :2, None] + axes @ circle
     lines = np.stack([around[..., :-1], around[..., 1:]], axis=-1)  # (n, 2, corners, 2 ends)
     return _lifted(np.moveaxis(lines, 1, -1).reshape(-1, 2))

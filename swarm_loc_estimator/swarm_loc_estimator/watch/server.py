@@ -89,8 +89,7 @@ class _Slot(NamedTuple):
 class Access:
     """Decides which requests the server accepts; without a token, only on a loopback address.
 
-    Raises:
-        AccessError: The address is reachable from outside without a token, or the token is too short.
+    Raises AccessError if the address is reachable from outside without a token, or the token is too short.
     """
 
     address: str

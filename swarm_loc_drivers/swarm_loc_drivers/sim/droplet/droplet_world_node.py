@@ -15,18 +15,16 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.robot_driver_node import stamp_message, yaw_quaternion
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import (
     STEP_NS,
     DropletWorldParameters,
-    Fix,
     SimulatedDroplet,
     Tracker,
     make_droplet_world,
 )
 from swarm_loc_drivers.sim.world_node import WorldNode
-from swarm_loc_estimator.common.messages.poses import planar_covariance
+from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.common.node import run_node
 
 _FIX_QOS = QoSProfile(depth=10)
@@ -58,19 +56,10 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         """Step the world; publish the time and then the fixes of the tracker."""
         self._world.step()
         self.publish_step(self._world.now_ns, self._world.poses)
+        variances = np.square([self.params.fix_sigma, self.params.fix_sigma, self.params.fix_heading_sigma])
         for fix in self._tracker.look(self._world.now_ns, self._world.poses):
-            self._fixes[fix.robot].publish(self._fix_message(fix))
-
-    def _fix_message(self, fix: Fix) -> PoseWithCovarianceStamped:
-        message = PoseWithCovarianceStamped()
-        message.header.stamp = stamp_message(fix.stamp_ns)
-        message.header.frame_id = "map"
-        pose, sigma, heading_sigma = message.pose.pose, self.params.fix_sigma, self.params.fix_heading_sigma
-        pose.position.x, pose.position.y = float(fix.pose[0]), float(fix.pose[1])
-        pose.orientation = yaw_quaternion(float(fix.pose[2]))
-        covariance = planar_covariance(sigma**2, sigma**2, heading_sigma**2)
-        message.pose.covariance = np.ravel(covariance)
-        return message
+            message = encode_fix("map", fix.stamp_ns, fix.pose, np.diag(variances))
+            self._fixes[fix.robot].publish(message)
 
 
 main = partial(run_node, "droplet_world_node", DropletWorldNode)

@@ -9,9 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from swarm_loc_drivers.droplet.hardware import (
     DIRECTIONS,
     EMIT_DELAY_NS,
@@ -23,6 +20,7 @@ from swarm_loc_drivers.droplet.hardware import (
     gait,
 )
 from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand
+from swarm_loc_estimator.common.arrays import IntArray
 
 
 class DropletBody(Protocol):
@@ -70,16 +68,16 @@ _BUSY_EXCHANGING = 4
 _PROCESSING = 1 << 6
 _BACKSPACE, _ESCAPE = 8, 27
 
-Print = Callable[[int, int, NDArray[np.int64]], str]
+Print = Callable[[int, int, IntArray], str]
 """Emitter's id, receiver's id, readings (n, n) emitters by sensors -> what the user's program prints."""
 
 
-def print_named(emitter: int, receiver: int, readings: NDArray[np.int64]) -> str:
+def print_named(emitter: int, receiver: int, readings: IntArray) -> str:
     """The format with the ids of both robots."""
     return f'{{"{emitter:04X}", "{receiver:04X}", {_braces(readings)}}},\r\n'
 
 
-def _braces(readings: NDArray[np.int64]) -> str:
+def _braces(readings: IntArray) -> str:
     return "{" + ",".join("{" + ",".join(map(str, row)) + "}" for row in readings.tolist()) + "}"
 
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet import hardware as timing
 from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
 from swarm_loc_estimator import expected_brightness
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 
@@ -28,7 +27,7 @@ class ExchangeReadings(NamedTuple):
     """An exchange in which this robot measured."""
 
     emitter: int  # Id of the robot that emitted
-    readings: NDArray[np.int64]  # (n, n) emitters by sensors, baseline taken off [count]
+    readings: IntArray  # (n, n) emitters by sensors, baseline taken off [count]
     end_ns: int  # End of the exchange
 
 
@@ -44,7 +43,7 @@ class InfraredMessage:
     sender: int  # Index of the robot
     begin_ns: int  # Start of the transmission
     end_ns: int  # End of the transmission
-    hearers: NDArray[np.int64]  # Indices of the robots in range at its start
+    hearers: IntArray  # Indices of the robots in range at its start
     line: str = ""  # The command; "" for the call that starts an exchange
     target: int = 0  # Id of the receiver; 0: all
     done: bool = False
@@ -62,9 +61,9 @@ class Exchange:
     begin_ns: int  # Start of the call
     power: int  # Power of the emitters
     # (k,) indices of the robots that received the call
-    receivers: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    receivers: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     # (k, n, n) emitters by sensors, measured so far
-    readings: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.int64))
+    readings: IntArray = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.int64))
     flashes: int = 0  # Number of flashes
     done: bool = False  # Whether its readings have been delivered
 
@@ -99,7 +98,7 @@ class DropletLight:
         self._elements = platform.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
     def falling_on(
-        self, poses: FloatArray, receivers: NDArray[np.int64], transmitter: int, emitter: int, power: int
+        self, poses: FloatArray, receivers: IntArray, transmitter: int, emitter: int, power: int
     ) -> FloatArray:
         """Counts (k, n) that the sensors of receivers (k,) would read without noise.
 
@@ -120,9 +119,7 @@ class DropletLight:
         light: FloatArray = np.einsum("l,lkn->kn", share, levels)
         return np.where(self._blocked(poses, receivers, transmitter, emitter), 0.0, light)
 
-    def _blocked(
-        self, poses: FloatArray, receivers: NDArray[np.int64], transmitter: int, emitter: int
-    ) -> BoolArray:
+    def _blocked(self, poses: FloatArray, receivers: IntArray, transmitter: int, emitter: int) -> BoolArray:
         """Sensors (k, n) with another robot between them and the emitter."""
         sensors = se2.transform_points(poses[receivers, None], self._elements)
         lit = se2.transform_points(poses[transmitter], self._elements[emitter])
@@ -168,7 +165,7 @@ class DropletInfrared:
         self,
         platform: IrPlatform,
         light: DropletLight,
-        ids: NDArray[np.int64],
+        ids: IntArray,
         settings: InfraredSettings,
         rng: np.random.Generator,
         now_ns: int,
@@ -235,7 +232,7 @@ class DropletInfrared:
         self._exchanges = [one for one in self._exchanges if one.end_ns > now_ns - _REMEMBERED_NS]
         self._messages = [one for one in self._messages if one.end_ns > now_ns - _REMEMBERED_NS]
 
-    def _in_reach(self, sender: int, poses: FloatArray) -> NDArray[np.int64]:
+    def _in_reach(self, sender: int, poses: FloatArray) -> IntArray:
         """Indices of the robots in range of a robot that no other robot occludes."""
         places = poses[:, :2]
         near = np.linalg.norm(places - places[sender], axis=1) <= self._settings.reach
@@ -272,7 +269,7 @@ class DropletInfrared:
             for other in self._messages
         )
 
-    def _begin_to_measure(self, call: InfraredMessage, receivers: NDArray[np.int64]) -> None:
+    def _begin_to_measure(self, call: InfraredMessage, receivers: IntArray) -> None:
         """Register the robots that received a call as receivers of its exchange."""
         for exchange in self._exchanges:
             if exchange.emitter == call.sender and exchange.begin_ns == call.begin_ns:

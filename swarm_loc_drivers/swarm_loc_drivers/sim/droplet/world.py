@@ -110,8 +110,7 @@ class DropletWorldSettings:
 class DropletWorld:
     """Droplets with ids (N,), 1 to 65535, each once, on a floor in map, where they begin at poses (N, 3).
 
-    Raises:
-        WorldError: The robots cannot be simulated.
+    Raises WorldError if the robots cannot be simulated.
     """
 
     def __init__(self, ids: Sequence[int], start: FloatArray, settings: DropletWorldSettings) -> None:
@@ -121,14 +120,12 @@ class DropletWorld:
         count = len(ids)
         self.ids = np.array(ids, dtype=np.int64)
         self.now_ns = settings.start_ns
-        self.poses: FloatArray = np.array(start, dtype=float)
-        """(N, 3) true poses of the robots in map."""
+        self.poses: FloatArray = np.array(start, dtype=float)  # (N, 3) true poses of the robots in map
         self._twists = np.zeros((count, 3))
         self._true = self._true_velocities(count)
         rng = self._random(settings.seed if settings.boards is None else settings.boards, _GAINS)
         gains = np.exp(settings.errors.gain_sigma * rng.standard_normal((2, count, ELEMENTS)))
-        self.gains: FloatArray = gains
-        """(2, N, n) true factors of sensors and emitters."""
+        self.gains: FloatArray = gains  # (2, N, n) true factors of sensors and emitters
         self.infrared = DropletInfrared(
             settings.platform,
             DropletLight(settings.platform, gains, NEAR_POWER),
@@ -277,19 +274,14 @@ def make_droplet_world(parameters: DropletWorldParameters) -> tuple[Swarm, Dropl
 def check_droplets(swarm: Swarm) -> None:
     """Check that every robot has a start and an infrared board.
 
-    Raises:
-        WorldError: A robot lacks one of them.
+    Raises WorldError if a robot lacks one of them.
     """
     for robot in swarm.robots:
         _needed(robot)
 
 
 def _needed(robot: Robot) -> tuple[RobotIr, Pose2]:
-    """The board and the start of a robot.
-
-    Raises:
-        WorldError: It has none.
-    """
+    """The board and the start of a robot; raises WorldError if it has none."""
     start = start_of(robot)
     if robot.ir is None:
         raise WorldError(f"robot '{robot.name}' has no infrared board, and a Droplet needs one.")

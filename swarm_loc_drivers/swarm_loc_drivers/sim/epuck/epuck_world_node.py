@@ -12,7 +12,6 @@ overhead camera, too, under `aerial/`. Images without subscribers are not drawn.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -77,7 +76,6 @@ class CameraOutput:
 
 _AERIAL = "aerial"  # Namespace of the overhead camera
 _ANSWER_QOS = QoSProfile(depth=100)
-_ANSWER_PATIENCE_S = 10.0
 _THROTTLE_S = 30.0
 
 
@@ -106,7 +104,6 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
             self._names.append(_AERIAL)
             self._cameras.append(CameraOutput(self, _AERIAL, overhead_model(params.overhead).calibration))
         # detections for which simulated time waits
-        self._held_since_s: float | None = None
         self._unanswered = Unanswered(params.answer_within)
         if params.answer_within > 0.0:
             for robot, name in enumerate(robot.name for robot in swarm.robots):
@@ -124,20 +121,17 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
             if self._cameras[exposure.robot].publish(exposure.stamp_ns, partial(self._world.image, exposure)):
                 self._unanswered.ask(exposure.robot, exposure.stamp_ns, now_ns)
 
-    def is_held(self) -> bool:
-        """Whether simulated time waits for the detections of an image; up to a limit of real time."""
-        if not self._unanswered.is_late(self._world.now_ns):
-            self._held_since_s = None
-            return False
-        now_s = time.monotonic()
-        self._held_since_s = self._held_since_s or now_s
-        if now_s > self._held_since_s + _ANSWER_PATIENCE_S:
-            name, self._held_since_s = self._names[self._unanswered.give_up()], None
-            self.get_logger().warning(
-                f"an image of {name} gave no {name}/detections; simulated time continues without them",
-                throttle_duration_sec=_THROTTLE_S,
-            )
-        return True
+    def waits(self) -> bool:
+        """Whether simulated time waits for the detections of an image."""
+        return self._unanswered.is_late(self._world.now_ns)
+
+    def give_up(self) -> None:
+        """Go on without the detections of the oldest image."""
+        name = self._names[self._unanswered.give_up()]
+        self.get_logger().warning(
+            f"an image of {name} gave no {name}/detections; simulated time continues without them",
+            throttle_duration_sec=_THROTTLE_S,
+        )
 
     def _on_detections(self, robot: int, message: MarkerDetectionArray | AnonymousDetectionArray) -> None:
         self._unanswered.answer(robot, nanoseconds(message.header.stamp))

@@ -20,7 +20,7 @@ from swarm_loc_drivers.epuck.hardware import (
     raw_of_distance,
 )
 from swarm_loc_drivers.epuck.wifi_session import SENSORS_DTYPE
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 
 class EpuckBody(Protocol):
@@ -38,7 +38,7 @@ class EpuckBody(Protocol):
     def wheel_steps(self) -> tuple[int, int]:
         """Return the whole steps done since power-on, left and right: open loop, blind to slip, unbounded."""
 
-    def proximity(self) -> NDArray[np.int64]:
+    def proximity(self) -> IntArray:
         """Return eight raw values in [0, 4095], ps0..ps7 clockwise from the front; close things give more."""
 
     def image(self) -> tuple[NDArray[np.uint8], int] | None:
@@ -124,7 +124,7 @@ _RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW
 
 def proximity_values(
     poses: FloatArray, robot: int, arena: tuple[float, float], rng: np.random.Generator
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Raw values (8,) of one of the robots at poses (N, 3) in map; the arena lies around map's origin [m]."""
     x, y, heading = poses[robot]
     outwards = heading + np.array(PROXIMITY_BEARINGS)

@@ -29,7 +29,7 @@ from swarm_loc_drivers.sim.worlds import (
     hidden_geometry,
     start_of,
 )
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -77,8 +77,7 @@ class Exposure:
 class EpuckWorld:
     """The robots of a swarm in their arena; each needs a start pose and a camera, every marker a heading.
 
-    Raises:
-        WorldError: The swarm cannot be simulated.
+    Raises WorldError if the swarm cannot be simulated.
     """
 
     def __init__(self, swarm: Swarm, settings: EpuckWorldSettings) -> None:
@@ -118,8 +117,7 @@ class EpuckWorld:
         phases = self._random(_PHASES).integers(0, self._period_ns, count)
         self._first_ns: list[int] = (first_ns + phases).tolist()
         self._next = [self._exposure(robot, 0) for robot in range(count)]
-        self.newest: list[Exposure | None] = [None] * count
-        """The last image that each camera has taken."""
+        self.newest: list[Exposure | None] = [None] * count  # The last image that each camera has taken
 
     def step(self) -> list[Exposure]:
         """Step by STEP_NS; returns the images taken meanwhile, by stamp."""
@@ -151,7 +149,7 @@ class EpuckWorld:
         rng = self._random(_SENSOR, exposure.robot, exposure.number)
         return self.rig.take(exposure.robot, exposure.middle_ns, track, rng)
 
-    def proximity(self, robot: int) -> NDArray[np.int64]:
+    def proximity(self, robot: int) -> IntArray:
         """Raw values (8,) of a robot's proximity sensors now."""
         rng = self._random(_PROXIMITY, robot, self.now_ns)
         return proximity_values(self.poses, robot, self._settings.arena.size, rng)
@@ -162,10 +160,6 @@ class EpuckWorld:
         self.newest[robot] = exposure
         self._next[robot] = self._exposure(robot, exposure.number + 1)
         return exposure
-
-    def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
-        """The exposure of a camera nearest to a stamp, at any time."""
-        return self._exposure(robot, round((stamp_ns - self._first_ns[robot]) / self._period_ns))
 
     def _exposure(self, robot: int, number: int) -> Exposure:
         """The exposure of a number; it happens before its stamp, by the world's error."""
@@ -210,7 +204,7 @@ class SimulatedEpuck:
         left, right = self._world.steps[self._robot].tolist()
         return int(left), int(right)
 
-    def proximity(self) -> NDArray[np.int64]:
+    def proximity(self) -> IntArray:
         """Raw values, ps0..ps7 clockwise from the front."""
         return self._world.proximity(self._robot)
 
@@ -230,11 +224,7 @@ class SimulatedEpuck:
 
 
 def check_swarm(swarm: Swarm) -> None:
-    """Check that a swarm can be simulated.
-
-    Raises:
-        WorldError: A robot or a marker lacks something.
-    """
+    """Check that a swarm can be simulated; raises WorldError if a robot or a marker lacks something."""
     for robot in swarm.robots:
         start_of(robot)
         if robot.camera is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.protocol import SENSOR_PX
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import number
 
 
@@ -181,7 +181,7 @@ def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[Any]) -> _Raw:
     return x, y, polarity, time_us
 
 
-def _switches(begin_us: int, end_us: int, blinking: Blinking) -> tuple[IntArray, NDArray[np.bool_]]:
+def _switches(begin_us: int, end_us: int, blinking: Blinking) -> tuple[IntArray, BoolArray]:
     """Times within a step at which a light is switched on or off (N,), and whether off."""
     period, lit = blinking
     if not 0 < lit < period:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.protocol import BAUD_RATE, MAX_VELOCITY, TIMESTAMPS, FirmwareGeneration
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
+from swarm_loc_estimator.common.arrays import IntArray
 
 _PERIOD = 50 * 192  # Period of the pulses: 50 us of a timer of 192 MHz
 _GAIN = 80  # Proportional gain of the velocity controller [counts of the timer per tick]
@@ -103,7 +104,7 @@ class EventRing:
     def __len__(self) -> int:
         return len(self._words)
 
-    def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
+    def put(self, words: NDArray[np.uint16], times_us: IntArray, sent: int) -> None:
         """Take events `0yyyyyyy pxxxxxxx` (N,), in order, with their board's time (N,) [us].
 
         `sent` events are sent while these come, which leave their places.
@@ -139,17 +140,13 @@ class EventRing:
         return data
 
 
-def _fixed(words: NDArray[np.uint16], times: NDArray[np.int64], stamp_bytes: int) -> bytes:
+def _fixed(words: NDArray[np.uint16], times: IntArray, stamp_bytes: int) -> bytes:
     """Events with timestamps of one length, the most significant byte first."""
-    table = np.empty((len(words), 2 + stamp_bytes), np.uint8)
-    table[:, 0] = words >> 8 | 0x80
-    table[:, 1] = words & 0xFF
-    for k in range(stamp_bytes):
-        table[:, 2 + k] = times >> 8 * (stamp_bytes - 1 - k) & 0xFF
-    return table.tobytes()
+    stamps = times[:, None] >> 8 * np.arange(stamp_bytes)[::-1] & 0xFF
+    return np.column_stack([words >> 8 | 0x80, words & 0xFF, stamps]).astype(np.uint8).tobytes()
 
 
-def _differences(words: NDArray[np.uint16], deltas: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
+def _differences(words: NDArray[np.uint16], deltas: IntArray, sizes: IntArray) -> bytes:
     """Events with the time since the last one, seven bits a byte, the last byte marked."""
     ends = np.cumsum(sizes)
     data = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
@@ -298,7 +295,7 @@ class Board:
             self._report_in, self._report_due = period_ms, False
         self._report_period = period_ms
 
-    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
+    def see(self, words: NDArray[np.uint16], times_us: IntArray, sent: int) -> None:
         """Take the camera's events (N,) with times of the world [us]; see `EventRing.put`."""
         if self.is_streaming:
             self.ring.put(words, times_us - self._boot_us, sent)
@@ -448,7 +445,7 @@ class PushbotFirmware:
         self._work()
         self.board.run_controllers()
 
-    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64]) -> None:
+    def see(self, words: NDArray[np.uint16], times_us: IntArray) -> None:
         """The camera has seen events `0yyyyyyy pxxxxxxx` (N,) at times of the world (N,) [us]."""
         self.board.see(words, times_us, self._budget() // 2)
 

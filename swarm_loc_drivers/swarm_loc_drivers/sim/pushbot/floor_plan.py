@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator import load_map
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError
@@ -76,10 +75,8 @@ def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> Bo
 def floor_plan(plan: str) -> FloorPlan:
     """A floor plan by its name in `FLOOR_PLANS`, or from a YAML or JSON file.
 
-    A file has either walls with the keys of `floor_plans.json`, or a map of ROS's map_server.
-
-    Raises:
-        UserError: There is no such plan, or the file cannot be used.
+    A file has either walls with the keys of `floor_plans.json`, or a map of ROS's map_server. Raises
+    UserError if there is no such plan, or the file cannot be used.
     """
     if plan in FLOOR_PLANS:
         return FLOOR_PLANS[plan]
@@ -95,11 +92,7 @@ def floor_plan(plan: str) -> FloorPlan:
 
 
 def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
-    """A floor plan from its description.
-
-    Raises:
-        FloorPlanError: The description cannot be used.
-    """
+    """A floor plan from its description; raises FloorPlanError if the description cannot be used."""
     about = checks.mapping(tree, WHOLE_FILE, _KEYS)
 
     def rows(tree: Tree, key: str, width: int) -> list[tuple[float, ...]]:
@@ -132,20 +125,21 @@ def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
 def _plan_of_map(path: Path) -> FloorPlan:
     """The walls around the occupied cells of a map; where its image ends is a wall, too.
 
-    Raises:
-        UserError: The map cannot be used.
+    Raises UserError if the map cannot be used.
     """
     grid = load_map(path)
-    walls = grid.cell * _boundaries(grid.occupied) + np.tile(grid.corner, 2)
+    # lines (S, 4) between solid and free cells of the grid (nx, ny), in cells; all around it is solid
+    padded = np.pad(grid.occupied, 1, constant_values=True)
+    x, low, high = _runs(padded[1:] != padded[:-1]).T
+    y, left, right = _runs((padded[:, 1:] != padded[:, :-1]).T).T
+    upright = np.column_stack([x, low - 1, x, high - 1])
+    level = np.column_stack([left - 1, y, right - 1, y])
+    walls = grid.cell * np.vstack([upright, level]).astype(float) + np.tile(grid.corner, 2)
     return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), TreeChecks(path, FloorPlanError))
 
 
 def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
-    """A plan without walls of no length.
-
-    Raises:
-        FloorPlanError: It has no walls, or too many.
-    """
+    """A plan without walls of no length; raises FloorPlanError if it has no walls, or too many."""
     lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
     walls = plan.walls[lengths > 0.0]
     if not 0 < len(walls) <= _MAX_WALLS:
@@ -153,17 +147,7 @@ def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
     return replace(plan, walls=walls)
 
 
-def _boundaries(solid: BoolArray) -> FloatArray:
-    """Lines (S, 4) between solid and free cells of a grid (nx, ny), in cells; all around it is solid."""
-    padded = np.pad(solid, 1, constant_values=True)
-    x, low, high = _runs(padded[1:] != padded[:-1]).T
-    y, left, right = _runs((padded[:, 1:] != padded[:, :-1]).T).T
-    upright = np.column_stack([x, low - 1, x, high - 1])
-    level = np.column_stack([left - 1, y, right - 1, y])
-    return np.vstack([upright, level]).astype(float)
-
-
-def _runs(rows: BoolArray) -> NDArray[np.int64]:
+def _runs(rows: BoolArray) -> IntArray:
     """Row, begin and end (R, 3) of the runs of True in each row (n, m)."""
     flips = np.diff(np.pad(rows, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, begin = np.nonzero(flips > 0)

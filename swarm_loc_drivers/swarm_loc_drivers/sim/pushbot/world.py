@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.protocol import GENERATIONS, SECOND_FIRMWARE
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import (
     FLOOR_PLANS,
     FloorPlan,
@@ -82,21 +81,10 @@ class PushbotWorldParameters(LinkedWorldParameters):
     camera: CameraNoise = field(default_factory=CameraNoise, metadata={"numbers_of": CameraNoise})
 
 
-class StepsAlong(Protocol):
-    """A firmware that is stepped with the world."""
-
-    def millisecond(self) -> None:
-        """A millisecond has passed."""
-
-    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64]) -> None:
-        """The camera has seen events; see `PushbotFirmware.see`."""
-
-
 class PushbotWorld:
     """Robots in a hall; of the parameters, files, links and the plan's name are not used.
 
-    Raises:
-        WorldError: A robot starts within a wall or another robot.
+    Raises WorldError if a robot starts within a wall or another robot.
     """
 
     def __init__(self, starts: list[Pose2], plan: FloorPlan, params: PushbotWorldParameters) -> None:
@@ -107,13 +95,11 @@ class PushbotWorld:
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
         """(N, 3) true poses of the robots in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
-        self.optics = assembled_robots(params.seed, count)
-        """Optics of the robots, for evaluation."""
+        self.optics = assembled_robots(params.seed, count)  # Optics of the robots, for evaluation
         self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""
-        self.firmwares: list[StepsAlong | None] = [None] * count
-        self.sight = HallSight(plan.walls, self.optics, params.camera, rng)
-        """The event cameras of the robots."""
+        self.firmwares: list[PushbotFirmware | None] = [None] * count
+        self.sight = HallSight(plan.walls, self.optics, params.camera, rng)  # The event cameras of the robots
         self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
         self._drive = Drive(params.wheel_separation, params.wheel_noise, params.turn_slip)
         self._radii = np.full(count, BODY_RADIUS_M)
@@ -185,8 +171,7 @@ class SimulatedPushbot:
 def make_pushbot_world(params: PushbotWorldParameters) -> tuple[Swarm, PushbotWorld]:
     """The swarm as described, and its world.
 
-    Raises:
-        UserError: A parameter, the swarm description or the floor plan cannot be used.
+    Raises UserError if a parameter, the swarm description or the floor plan cannot be used.
     """
     swarm = load_swarm(Path(params.swarm_file))
     try:

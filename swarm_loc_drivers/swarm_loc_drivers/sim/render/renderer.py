@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.render.raster import (
 )
 from swarm_loc_drivers.sim.render.scene import ROOM
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.swarm.swarm import CameraMount
 from swarm_loc_vision.common.camera import CX, CY, FX
 
@@ -43,8 +43,7 @@ _NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64  # Of these ways, and from which 
 _NOISE_LENGTH = 1 << 20
 
 
-PosesAt = Callable[[NDArray[np.int64]], FloatArray]
-"""True poses (K, N, 3) of all robots in map at times (K,) [ns]."""
+PosesAt = Callable[[IntArray], FloatArray]  # True poses (K, N, 3) of all robots in map at times (K,) [ns]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import HiddenGeometry
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
@@ -186,7 +186,7 @@ class OverheadRig:
     def take(self, middle_ns: int, track: Trajectories, rng: np.random.Generator) -> NDArray[np.uint8]:
         """The image (height, width), exposed around `middle_ns`; see `CameraRig.take`."""
 
-        def poses_at(times: NDArray[np.int64]) -> FloatArray:
+        def poses_at(times: IntArray) -> FloatArray:
             robots = track.all_at(times)
             still = np.zeros((len(times), 1, 3))
             shadows = robots * [1.0, 1.0, 0.0]

@@ -10,10 +10,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.raster import Patches
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_vision.aerial.pattern import MARK_RADIUS
 
 BLACK, WHITE = 0.05, 0.85
@@ -102,7 +101,7 @@ def patches(surfaces: Sequence[Surface]) -> Patches:
     )
 
 
-def marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size: float) -> Patches:
+def marker(pose: Sequence[float], height: float, cells: BoolArray, size: float) -> Patches:
     """A marker on its sheet, one cell wider all round, at x, y [m] and the direction out of its face [rad].
 
     The cells (n, n) are those of the black square, border included; True is white. The square's side, and the
@@ -111,7 +110,7 @@ def marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size:
     return _printed(upright(pose[0], pose[1], height, pose[2]), cells, size)
 
 
-def _printed(sheet: Surface, cells: NDArray[np.bool_], size: float) -> Patches:
+def _printed(sheet: Surface, cells: BoolArray, size: float) -> Patches:
     """A sheet with a marker on it."""
     half, cell = 0.5 * size, size / len(cells)
     sheet.rectangle(-half - cell, -half - cell, half + cell, half + cell, WHITE, covers=True)
@@ -124,7 +123,7 @@ def _printed(sheet: Surface, cells: NDArray[np.bool_], size: float) -> Patches:
     return patches([sheet])
 
 
-def lying_marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size: float) -> Patches:
+def lying_marker(pose: Sequence[float], height: float, cells: BoolArray, size: float) -> Patches:
     """A marker on its sheet that lies level and looks up; arguments as for `marker`.
 
     The last number of the pose is the direction to the marker's own right, from the x axis of the frame.

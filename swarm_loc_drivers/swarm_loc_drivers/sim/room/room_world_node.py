@@ -10,7 +10,6 @@ capture and fixes. `<robot>/cmd_vel` drives a robot.
 from __future__ import annotations
 
 import heapq
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,8 +34,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import SwarmPoses
 
 _QOS = QoSProfile(depth=20)
-_BEHIND_NS, _PATIENCE_S = 500_000_000, 10.0
-"""Simulated time waits for poses that are older, for so long in real time; then nobody publishes any."""
+_BEHIND_NS = 500_000_000  # Simulated time waits for poses that are older
 _STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -65,7 +63,6 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
         self._on_the_way: list[tuple[int, Message]] = []
         # an estimator for which simulated time waits
         self._located_ns: int | None = None
-        self._held_since_s: float | None = None
         self.create_subscription(SwarmPoses, "swarm/poses", self._on_poses, _QOS)
 
     def step(self) -> None:
@@ -80,16 +77,13 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
             topic, data = heapq.heappop(self._on_the_way)[1]
             self._outputs[topic].publish(data)
 
-    def is_held(self) -> bool:
-        """Whether simulated time waits for an estimator that is behind; up to a limit of real time."""
-        if self._located_ns is None or self._world.now_ns <= self._located_ns + _BEHIND_NS:
-            self._held_since_s = None
-            return False
-        now_s = time.monotonic()
-        self._held_since_s = self._held_since_s or now_s
-        if now_s > self._held_since_s + _PATIENCE_S:
-            self._located_ns = None
-        return True
+    def waits(self) -> bool:
+        """Whether simulated time waits for an estimator that is behind."""
+        return self._located_ns is not None and self._world.now_ns > self._located_ns + _BEHIND_NS
+
+    def give_up(self) -> None:
+        """Nobody publishes poses any more."""
+        self._located_ns = None
 
     def _on_poses(self, message: SwarmPoses) -> None:
         self._located_ns = nanoseconds(message.header.stamp)

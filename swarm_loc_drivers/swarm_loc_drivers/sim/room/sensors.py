@@ -364,11 +364,7 @@ KINDS = (ReportedMotion, Gyroscope, Lidar, Radios, CeilingCameras, MotionCapture
 
 
 def sensors_of(world: RoomWorld) -> list[SimulatedSensor]:
-    """The sensors of a swarm in its world.
-
-    Raises:
-        WorldError: One cannot be simulated.
-    """
+    """The sensors of a swarm in its world; raises WorldError if one cannot be simulated."""
     seeds = np.random.default_rng([world.seed, 1]).spawn(len(KINDS))
     found = [kind(world, rng) for kind, rng in zip(KINDS, seeds, strict=True)]
     return [one for one in found if one.topics]

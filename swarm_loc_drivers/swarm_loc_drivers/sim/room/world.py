@@ -49,8 +49,7 @@ class Room:
 def room_of(swarm: Swarm, plan: str) -> Room:
     """The room of a swarm: that of a plan, if one is given.
 
-    Raises:
-        UserError: The plan or the map cannot be used.
+    Raises UserError if the plan or the map cannot be used.
     """
     path = swarm.map if isinstance(swarm.map, Path) else None
     if path is not None and path.exists():
@@ -100,11 +99,7 @@ def radius_of(robot: Robot) -> float:
 
 
 def room_starts(swarm: Swarm, room: Room, seed: int) -> FloatArray:
-    """Poses (N, 3) in the room, off its walls and each other.
-
-    Raises:
-        WorldError: The room is too small.
-    """
+    """Poses (N, 3) in the room, off its walls and each other; raises WorldError if the room is too small."""
     rng = np.random.default_rng([seed, len(swarm.robots)])
     radius = max(radius_of(robot) for robot in swarm.robots)
     free = np.pad(room.map.free, 1).astype(np.uint8)
@@ -140,8 +135,7 @@ class RoomWorld:
         """(N, 3) true poses of the robots in map."""
         self.reported: FloatArray = np.zeros_like(self.poses)
         """(N, 3) poses by odometry, each robot's own frame."""
-        self.radii = np.array([radius_of(robot) for robot in swarm.robots])
-        """(N,) of the bodies [m]."""
+        self.radii = np.array([radius_of(robot) for robot in swarm.robots])  # (N,) of the bodies [m]
         models = [robot.odometry for robot in swarm.robots]
         scales = [[one.distance_scale, one.turn_scale] for one in models]
         sigmas = [[one.distance_scale_sigma, one.turn_scale_sigma] for one in models]

@@ -29,8 +29,7 @@ class Lemniscate:
 
     def __init__(self, half_width: float) -> None:
         self.half_width = half_width
-        self.length = 4.0 * half_width * float(ellipk(-1.0))
-        """Once around [m]."""
+        self.length = 4.0 * half_width * float(ellipk(-1.0))  # Once around [m]
         self._parameter = np.linspace(0.0, 2.0 * np.pi, _TABLE_SIZE)
         self._travelled = half_width * ellipkinc(self._parameter, -1.0)
 

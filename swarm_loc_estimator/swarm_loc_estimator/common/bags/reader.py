@@ -110,10 +110,7 @@ class BagReader:
     """An open bag, as a context manager: a rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
 
     Topic names come without the leading slash, as `robot1/odom`. `renamed` has by topic of the bag the name
-    that it has here; a topic of that name in the bag is hidden.
-
-    Raises:
-        BagError: There is nothing to read.
+    that it has here; a topic of that name in the bag is hidden. Raises BagError if there is nothing to read.
     """
 
     def __init__(self, path: Path, renamed: Mapping[str, str] = MappingProxyType({})) -> None:

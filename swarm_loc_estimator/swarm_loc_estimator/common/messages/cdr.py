@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.parameters import UserError
 
 MESSAGE_PACKAGE = "swarm_loc_msgs"
@@ -200,7 +201,7 @@ def nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
-def stamp_rows(stamp_ns: NDArray[np.int64]) -> Rows:
+def stamp_rows(stamp_ns: IntArray) -> Rows:
     """Stamps (n,) [ns] as rows of builtin_interfaces/Time."""
     rows = np.empty(len(stamp_ns), row_dtype(TIME))
     rows["sec"], rows["nanosec"] = np.divmod(stamp_ns, SECOND_NS)
@@ -213,9 +214,7 @@ def decode(data: bytes, message_type: str, places: dict[str, list[int]] | None =
     `places` gets the offsets of each field by its path, such as "robots.x"; those of strings and sequences
     are of their length. The fields are attributes of the result: numbers, texts, arrays of numbers, messages.
     A sequence of messages of fixed size is a structured array, see `row_dtype`; any other one is a list.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
+    Raises CdrError if the bytes are not one whole message.
     """
     reader = _CdrReader(data, places)
     message = reader.message(message_type)

@@ -125,8 +125,7 @@ def swarm_key(names: Iterable[str]) -> int:
 def decode_shared_numbers(data: bytes, widths: tuple[int, ...]) -> SharedMessage:
     """Read a SwarmOdometry or SwarmFixes, with `widths` numbers of a reading in each column.
 
-    Raises:
-        CdrError: The bytes are not one whole message, or its columns differ in length.
+    Raises CdrError if the bytes are not one whole message, or its columns differ in length.
     """
     message = decode(data, cdr.SWARM_ODOMETRY if len(widths) == 1 else cdr.SWARM_FIXES)
     columns = [message.pose] if len(widths) == 1 else [message.pose, message.covariance]

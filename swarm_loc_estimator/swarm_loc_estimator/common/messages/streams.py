@@ -18,7 +18,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, MAX_PADDING, SECOND_NS, CdrError
 from swarm_loc_estimator.common.messages.detections import (
@@ -87,7 +87,7 @@ class MessageBatch(NamedTuple):
         for topic, log_ns, offset, length in zip(*(c.tolist() for c in columns), strict=True):
             yield topic, log_ns, bytes(view[offset : offset + length])
 
-    def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
+    def chosen(self, k: slice | NDArray[np.intp] | BoolArray) -> MessageBatch:
         """Some of them, in the same buffer."""
         return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
 
@@ -214,7 +214,7 @@ class PoseColumns:
     pose: FloatArray  # (n, 3) x [m], y [m], yaw [rad]; yaw is NaN when the quaternion is zero
     # (n, 3) forward and left [m/s] and turn rate [rad/s] of nav_msgs/Odometry; NaN for other types
     twist: FloatArray
-    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
+    valid: BoolArray  # (n,) whether the bytes were a whole message of the type
     robot: IntArray = field(default_factory=_not_known)  # (n,) see `Messages`
     arrival_ns: IntArray = field(default_factory=_not_known)  # (n,) arrival times
 
@@ -267,7 +267,7 @@ class DetectionColumns:
     stamp_ns: IntArray  # (n,)
     count: IntArray  # (n,) detections per message
     detection: NDArray[np.void]  # (d,) of `DETECTION_DTYPE`
-    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
+    valid: BoolArray  # (n,) whether the bytes were a whole message of the type
     robot: IntArray = field(default_factory=_not_known)  # (n,) see `Messages`
     arrival_ns: IntArray = field(default_factory=_not_known)  # (n,) arrival times
 
@@ -317,7 +317,7 @@ class Messages(Generic[Message]):
     """Messages (n,) read whole."""
 
     stamp_ns: IntArray  #: (n,) stamps of their headers
-    valid: NDArray[np.bool_]  #: (n,) whether the bytes were a whole message of the type
+    valid: BoolArray  #: (n,) whether the bytes were a whole message of the type
     decoded: list[Message]  #: The valid ones
     #: (n,) index of the topic's robot, or N plus that of the camera; -1: swarm
     robot: IntArray = field(default_factory=_not_known)

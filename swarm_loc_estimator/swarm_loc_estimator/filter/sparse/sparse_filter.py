@@ -237,10 +237,8 @@ def updated(
 def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
     """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k) by its lower triangle.
 
-    Uses the inverse of K: the product takes half the time of solving with this many columns.
-
-    Raises:
-        LinAlgError: The matrix is not positive definite.
+    Uses the inverse of K: the product takes half the time of solving with this many columns. Raises
+    LinAlgError if the matrix is not positive definite.
     """
     if matrix.size:
         inverse = np.array(matrix, order="F")

@@ -97,7 +97,6 @@ class Options:
 class DriveFit:
     """Calibrated motion of a type of robot."""
 
-    members: tuple[int, ...]  # Indices of its robots
     drives: Mapping[int, Drive]  # Motion of the robots whose paths are known, by index
     late: Lateness  # Delay and lag
     response: MotionResponse | None  # Scale factors; None if only noise is fitted
@@ -152,10 +151,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 
     Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
     and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
-    are more rounds.
-
-    Raises:
-        CalibrationError: Too little is known about the poses of robots.
+    are more rounds. Raises CalibrationError if too little is known about the poses of robots.
     """
     begin, truth = problem_of(recording, swarm, fixed=True), recording.truth
     if options.plain:
@@ -312,14 +308,14 @@ def _fit_drive(
     own, prompt = [*drives.values()], Lateness(0.0, 0.0)
     before = explained(own, prompt, None)
     if options.plain:
-        return DriveFit(tuple(members), drives, prompt, None, before, before)
+        return DriveFit(drives, prompt, None, before, before)
     # paths of the batch are as late as it has taken the wheels to be
     late = fit_lateness(own, 1.0) if options.alone else fit_lateness(own)
     for _ in range(_BIAS_ROUNDS):
         response = fit_response(own, late, table=options.response)
         own = [biased(drive, late, response) for drive in own]
     drives = dict(zip(drives, own, strict=True))
-    return DriveFit(tuple(members), drives, late, response, before, explained(own, late, response))
+    return DriveFit(drives, late, response, before, explained(own, late, response))
 
 
 def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:

@@ -126,10 +126,8 @@ def read_recording(
 ) -> Recording:
     """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
-    `remap` is as in `renamed_topics`; `truth` by robot name replaces the ground truth of the bag.
-
-    Raises:
-        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    `remap` is as in `renamed_topics`; `truth` by robot name replaces the ground truth of the bag. Raises
+    BagError if nothing in the bag can be read, or a topic cannot be mapped.
     """
     parts: list[Batch] = []
     summary = read_bag(bag, swarm, parts.append, progress, remap)

@@ -76,8 +76,7 @@ class Exchange:
 def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
     """All exchanges of a file in the order of their times, and the number of unusable lines by reason.
 
-    Raises:
-        DropletRecordingError: It cannot be read, or holds no exchange.
+    Raises DropletRecordingError if it cannot be read, or holds no exchange.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -196,23 +195,7 @@ class CleanTruth:
 def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
     """Find the poses of all robots at each exchange."""
     remarks = Counter[str]()
-    owned: dict[int, list[Place]] = {}
-    for place in find_places(exchanges):
-        if len(place.seen) < 2:
-            remarks["sightings of robots on the move or seen once dropped"] += len(place.seen)
-        else:
-            owned.setdefault(place.owner, []).append(place)
-    poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
-    stand = 0
-    for owner, places in owned.items():
-        for place in _without_overlaps(places, remarks):
-            stand += 1
-            _write(place, owner, stand, poses, remarks)
-    return CleanTruth(poses, remarks)
-
-
-def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
-    """All places in the order of their first sightings."""
+    # all places in the order of their first sightings
     places, open_places = list[Place](), list[Place]()
     for moment, exchange in enumerate(exchanges):
         open_places = [
@@ -230,7 +213,20 @@ def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
                 open_places.append(nearest)
             nearest.add(moment, sighting)
             taken.add(id(nearest))
-    return places
+    # the places of each robot, and its poses there
+    owned: dict[int, list[Place]] = {}
+    for place in places:
+        if len(place.seen) < 2:
+            remarks["sightings of robots on the move or seen once dropped"] += len(place.seen)
+        else:
+            owned.setdefault(place.owner, []).append(place)
+    poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
+    stand = 0
+    for owner, places in owned.items():
+        for place in _without_overlaps(places, remarks):
+            stand += 1
+            _write(place, owner, stand, poses, remarks)
+    return CleanTruth(poses, remarks)
 
 
 def _without_overlaps(places: list[Place], remarks: Counter[str]) -> list[Place]:
@@ -304,10 +300,8 @@ def find_fiducials(
     """Find the orientation of all fiducials of a recording.
 
     `poses` has one mapping per exchange: robot -> pose in the image; angles (n,) are directions of the
-    elements in base_link [rad].
-
-    Raises:
-        DropletRecordingError: Matrices and camera contradict each other however the image is turned.
+    elements in base_link [rad]. Raises DropletRecordingError if matrices and camera contradict each other
+    however the image is turned.
     """
     floor = _CLEAR * _noise(exchanges)
     rows = [

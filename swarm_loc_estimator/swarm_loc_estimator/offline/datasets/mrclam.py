@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from swarm_loc_estimator.common import se2
@@ -54,7 +53,7 @@ class RobotLog:
     twist: FloatArray  # (N, 2) commanded forward speed [m/s] and turn rate [rad/s]
     sighting_ns: IntArray  # (M,) stamps, not decreasing
     sighting: FloatArray  # (M, 2) range [m] and bearing [rad, positive to the left]
-    barcode: npt.NDArray[np.int64]  # (M,) of each sighting
+    barcode: IntArray  # (M,) of each sighting
     truth: Trajectory | None  # Ground truth in map; None when there is none
 
 
@@ -71,8 +70,7 @@ class Dataset:
 def read_dataset(folder: Path) -> Dataset:
     """Read a folder, and correct barcodes that contradict the ground truth.
 
-    Raises:
-        MrclamError: It holds no such dataset, or a damaged file.
+    Raises MrclamError if it holds no such dataset, or a damaged file.
     """
     subjects = sorted(
         int(match[1]) for path in folder.glob("Robot*") if (match := _ODOMETRY.fullmatch(path.name))
@@ -148,7 +146,7 @@ def _barcode_remark(subject: int, noted: Mapping[int, int], used: Mapping[int, i
 def _seen_places(dataset: Dataset) -> dict[int, FloatArray]:
     """Barcode -> (K, 2) positions in map, from sightings by robots with a known pose."""
     found: list[FloatArray] = []
-    names: list[npt.NDArray[np.int64]] = []
+    names: list[IntArray] = []
     for robot in dataset.robots:
         if robot.truth is None:
             continue
@@ -272,8 +270,7 @@ def convert(
 ) -> MrclamImport:
     """Write a set as a bag with its `swarm.yaml` inside; robots start where their ground truth begins.
 
-    Raises:
-        BagError: The folder is there already, or cannot be created.
+    Raises BagError if the folder is there already, or cannot be created.
     """
     rng = np.random.default_rng(delay.seed)
     streams: list[Stream] = []
@@ -382,22 +379,7 @@ def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> Stre
     """Sightings of one stamp as one message, late by the delay."""
     name = f"robot{robot.subject}"
     stamp_ns, first = np.unique(robot.sighting_ns, return_index=True)
-    rows = _detection_rows(robot)
-    bounds = [*first.tolist(), len(rows)]
-    frame = f"{name}/camera_optical_frame"
-    data = [
-        encode_detections(frame, stamp, rows[begin:end])
-        for stamp, begin, end in zip(stamp_ns.tolist(), bounds, bounds[1:], strict=False)
-    ]
-    late_ns = rng.integers(delay.low_ns, delay.high_ns, len(stamp_ns), endpoint=True)
-    order = np.argsort(stamp_ns + late_ns, kind="stable")
-    return Stream(
-        f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
-    )
-
-
-def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
-    """(M,) sightings as detections: a position in the optical frame (x right, z forward), heading unknown."""
+    # (M,) sightings as detections: a position in the optical frame (x right, z forward), heading unknown
     rows = np.zeros(len(robot.barcode), DETECTION_DTYPE)
     distance, bearing = robot.sighting.T
     rows["id"] = robot.barcode
@@ -409,7 +391,17 @@ def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
     rows["position"][:, 2] = distance * np.cos(bearing)
     rows["orientation"][:, 3] = rows["alternative_orientation"][:, 3] = 1.0
     rows["covariance"] = UNKNOWN_COVARIANCE
-    return rows
+    # messages in the order of their arrival
+    bounds, frame = [*first.tolist(), len(rows)], f"{name}/camera_optical_frame"
+    data = [
+        encode_detections(frame, stamp, rows[begin:end])
+        for stamp, begin, end in zip(stamp_ns.tolist(), bounds, bounds[1:], strict=False)
+    ]
+    late_ns = rng.integers(delay.low_ns, delay.high_ns, len(stamp_ns), endpoint=True)
+    order = np.argsort(stamp_ns + late_ns, kind="stable")
+    return Stream(
+        f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
+    )
 
 
 def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> Stream:

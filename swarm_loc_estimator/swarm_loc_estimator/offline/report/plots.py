@@ -20,7 +20,7 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.patheffects import withStroke
 from PIL import Image
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -46,7 +46,7 @@ def length_unit(length: float) -> tuple[float, str]:
     return (1e3, "mm") if abs(length) < _MILLIMETRES_BELOW_M else (1.0, "m")
 
 
-def seconds_since(begin_ns: int, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def seconds_since(begin_ns: int, stamp_ns: IntArray) -> FloatArray:
     """Stamps as seconds since `begin_ns`."""
     return (stamp_ns - begin_ns).astype(np.float64) * 1e-9
 
@@ -65,7 +65,7 @@ def style(axis: Axes, title: str = "", x: str = "", y: str = "") -> None:
     axis.tick_params(colors=SOFT, labelsize=8, length=3)
 
 
-def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def broken(stamp_ns: IntArray, rows: FloatArray) -> FloatArray:
     """Rows with a row of NaN inserted in each gap of time, so that lines are interrupted there."""
     step_ns = np.diff(stamp_ns)
     if len(step_ns) == 0:
@@ -201,8 +201,7 @@ def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray]
     return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
 
 
-IN_MAP = "x in map [m]", "y in map [m]"
-"""Labels of axes."""
+IN_MAP = "x in map [m]", "y in map [m]"  # Labels of axes
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6  # Height of title, legend and axes
 _AROUND_MAP = Margins(left=0.65, right=0.15, bottom=0.9, top=0.7, across=0.5, down=0.6)

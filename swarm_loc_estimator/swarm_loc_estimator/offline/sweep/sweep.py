@@ -378,8 +378,7 @@ class Backend(NamedTuple):
 def workers(count: int, backend: Backend) -> Iterator[None]:
     """A context in which `joblib.Parallel` has `count` workers; -1: one for each processor.
 
-    Raises:
-        BackendError: A package is missing, or the cluster is not reached.
+    Raises BackendError if a package is missing, or the cluster is not reached.
     """
     start = {"ray": _ray, "dask": _dask}.get(backend.name)
     local = nullcontext({"backend": _Loky(inner_max_num_threads=1)})
@@ -439,11 +438,7 @@ def _reached(address: str | None) -> Iterator[None]:
 
 
 def loaded(module: str, extra: str) -> Any:
-    """A module that only some sweeps need.
-
-    Raises:
-        BackendError: It is not installed.
-    """
+    """A module that only some sweeps need; raises BackendError if it is not installed."""
     try:
         return import_module(module)
     except ImportError as error:

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.filter.measurements import select
@@ -66,11 +65,11 @@ _MAX_EVALUATIONS = 10
 class BoardReadings(NamedTuple):
     """Exchanges of robots with one kind of board at full power."""
 
-    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
-    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    receiver: IntArray  # (k,) index of the robot that measured
+    transmitter: IntArray  # (k,) index of the robot that lit its emitters
     readings: FloatArray  # (k, n, n) [count], [sensor, emitter], NaN where not measured or dead
     poses: FloatArray  # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]
-    stamp_ns: NDArray[np.int64]  # (k,)
+    stamp_ns: IntArray  # (k,)
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class BoardModel:
     platform: IrPlatform  # The board
     sensor_gains: FloatArray  # (robots, n) gains of the receivers' sensors; 1 where not estimated
     # (robots,) True where estimated; their spread is the platform's `element_sigma`
-    gains_sought: NDArray[np.bool_]
+    gains_sought: BoolArray
     truth_yaw: FloatArray  # (robots,) heading of each robot minus that of its ground truth [rad]
     scatter: FloatArray  # (k, n, n) residuals of the fitted readings [sigma]
     angles: FloatArray  # (2, k, n, n) angles of the paths at sensors and emitters [rad]
@@ -92,7 +91,19 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardModel
     The platform defines arrangement, saturation and initial noise. Gains of sensors with enough exchanges are
     estimated, too.
     """
-    noise = round(noise_floor(data), 2)
+    # robust standard deviation of dark readings [count], by the differences of one element's in successive
+    # exchanges of a receiver, so that offset and drift of the amplifier cancel
+    middle = float(np.nanmedian(data.readings))
+    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    steps = []
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
+        dark = np.abs(own - middle) < limit
+        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
+    found = np.concatenate(steps)
+    noise = round(float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5, 2)
+    # curves, law, gains and yaw with this noise, then the noise that is relative to readings
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
     unknowns = _Problem(platform, data, robots).first_unknowns()
     for _ in range(_ROUNDS):
@@ -118,30 +129,12 @@ def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatAr
     return moved
 
 
-def noise_floor(data: BoardReadings) -> float:
-    """Robust standard deviation of dark readings [count].
-
-    It is computed from differences of one element's dark readings in successive exchanges of a receiver, so
-    offset and drift of the amplifier cancel.
-    """
-    middle = float(np.nanmedian(data.readings))
-    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
-    steps = []
-    for receiver in np.unique(data.receiver).tolist():
-        rows = np.flatnonzero(data.receiver == receiver)
-        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
-        dark = np.abs(own - middle) < limit
-        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
-    found = np.concatenate(steps)
-    return float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
-
-
 class _Problem:
     """The least-squares problem for a platform with fixed noise."""
 
     def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int) -> None:
         self._platform, self._data, self._robots = platform, data, robots
-        self.gains_sought: NDArray[np.bool_] = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
+        self.gains_sought: BoolArray = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
         self._often = np.flatnonzero(self.gains_sought)
         count = len(_KNOTS)
         flat = ((1, np.zeros(count)), (1, np.zeros(count)))
@@ -328,8 +321,7 @@ class BoardRecording:
 def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
     """The exchanges with ground truth of the first kind of board of a swarm.
 
-    Raises:
-        CalibrationError: There are none.
+    Raises CalibrationError if there are none.
     """
     group, stamp_ns = exchanges_of(recording, swarm)
     known = np.isfinite(group.exchanges.poses[:, 0])
@@ -348,11 +340,7 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
 def calibrate_from(
     recording: Recording, swarm: Swarm, progress: Progress
 ) -> tuple[BoardRecording, BoardCalibration]:
-    """Calibrate the board of a recording.
-
-    Raises:
-        CalibrationError: There is too little ground truth.
-    """
+    """Calibrate the board of a recording; raises CalibrationError if there is too little ground truth."""
     progress(0.0, "exchanges")
     board = read_board(recording, swarm)
     progress(0.1, "fitting, and validating on blocks of time")
@@ -386,19 +374,14 @@ def _clear(
             places[k] = interpolate(recording.truth[robot.name], data.stamp_ns, _TRUTH_GAP_NS)[0][:, :2]
     rows, of_swarm = np.arange(len(data.stamp_ns)), np.array(robots)
     begin, end = (places[of_swarm[side], rows] for side in (data.receiver, data.transmitter))
-    clear = np.ones(len(rows), dtype=np.bool_)
+    way, clear = end - begin, np.ones(len(rows), dtype=np.bool_)
     for k, others in enumerate(places):
-        away = _distance_to_line(others, begin, end)
+        # distance (k,) of this robot from the lines of sight
+        share = np.sum((others - begin) * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12)
+        away = np.linalg.norm(others - begin - np.clip(share, 0.0, 1.0)[:, None] * way, axis=1)
         third = (of_swarm[data.receiver] != k) & (of_swarm[data.transmitter] != k)
         clear &= ~(third & (away < width))
     return clear
-
-
-def _distance_to_line(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Distances (k,) from points to line segments; all arguments (k, 2)."""
-    way = end - begin
-    share = np.sum((points - begin) * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12)
-    return np.asarray(np.linalg.norm(points - begin - np.clip(share, 0.0, 1.0)[:, None] * way, axis=1))
 
 
 GAIN_SIGMA = 0.05
@@ -464,10 +447,8 @@ class BoardCalibration:
 def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
     """Calibrate a board by exchanges with known poses.
 
-    The initial platform defines the arrangement and the saturation count.
-
-    Raises:
-        CalibrationError: There are too few exchanges.
+    The initial platform defines the arrangement and the saturation count. Raises CalibrationError if there
+    are too few exchanges.
     """
     if len(data.receiver) < MIN_EXCHANGES:
         raise CalibrationError(
@@ -489,7 +470,11 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
     platform = replace(model.platform, stray_noise=stray, covariance_scale=scale)
     held = replace(held, nees=held.nees / scale)
     brightest = np.nanmax(np.nan_to_num(data.readings), axis=(0, 2))
-    sigma = stock_residual(start, alive)
+    # RMS residual of unsaturated readings of the initial platform at the true poses [sigma]
+    bright = expected_brightness(replace(start, amplitudes=start.amplitudes[:1]), alive.poses)[:, 0]
+    usable = (alive.readings < start.saturation) & (bright < start.saturation)  # False for NaN
+    off = (alive.readings - bright) / np.hypot(start.noise, start.relative * bright)
+    sigma = float(np.sqrt(np.mean(off[usable] ** 2))) if usable.any() else np.inf
     return BoardCalibration(replace(model, platform=platform), sigma, held, gains, elements, brightest)
 
 
@@ -515,14 +500,6 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
     errors = solutions.poses[found] - truth[found]
     errors[:, 1:] = wrap_angle(errors[:, 1:])
     return HeldOut(errors, nees(errors, solutions.covariances[found]), len(found))
-
-
-def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
-    """RMS residual of unsaturated readings at the true poses [sigma]."""
-    bright = expected_brightness(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
-    usable = (data.readings < platform.saturation) & (bright < platform.saturation)  # False for NaN
-    off = (data.readings - bright) / np.hypot(platform.noise, platform.relative * bright)
-    return float(np.sqrt(np.mean(off[usable] ** 2))) if usable.any() else np.inf
 
 
 def without_dead(
@@ -555,7 +532,7 @@ def _cross_validated(
     return {one: _joined(found) for one, found in parts.items()}
 
 
-def _blocks(data: BoardReadings) -> NDArray[np.int64]:
+def _blocks(data: BoardReadings) -> IntArray:
     """Block of time (k,) of each exchange; blocks divide the exchanges of each receiver evenly."""
     blocks = np.zeros(len(data.receiver), dtype=np.int64)
     for receiver in np.unique(data.receiver).tolist():

@@ -31,7 +31,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc, fdtrc, logsumexp
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -258,7 +257,7 @@ class ReadingLimits:
 class _Repeats(NamedTuple):
     """Pairs of consecutive exchanges of one receiver with one transmitter."""
 
-    receiver: NDArray[np.int64]  # (p,) index of the receiver
+    receiver: IntArray  # (p,) index of the receiver
     change: FloatArray  # (p, n, n) change of readings [count]; 0 where one of the two is unusable
     level: FloatArray  # (p, n, n) mean of both readings
     known: BoolArray  # (p, n, n) True where both are usable
@@ -326,14 +325,7 @@ def _same_readings(readings: FloatArray, k: int, others: list[int]) -> BoolArray
     return same
 
 
-def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
-    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
-    _, number = np.unique(pairs, axis=1, return_inverse=True)
-    in_order = np.argsort(number.ravel(), kind="stable")
-    return np.split(in_order, np.flatnonzero(np.diff(number.ravel()[in_order])) + 1)
-
-
-def _tops(exchanges: Exchanges) -> tuple[FloatArray, NDArray[np.int64]]:
+def _tops(exchanges: Exchanges) -> tuple[FloatArray, IntArray]:
     """Brightest reading (k, n) of each sensor in each exchange, and the index of its emitter."""
     readings = np.nan_to_num(exchanges.readings[:, 0], nan=-np.inf)
     emitter = readings.argmax(axis=2)
@@ -341,7 +333,7 @@ def _tops(exchanges: Exchanges) -> tuple[FloatArray, NDArray[np.int64]]:
     return top, exchanges.transmitter[:, None] * readings.shape[2] + emitter
 
 
-def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
+def _pile(tops: FloatArray, emitters: IntArray, alarm: float) -> float:
     """Saturation of a sensor from its readings (k,) [count]; NaN where not significant at level `alarm`."""
     highest = float(tops.max())
     if not highest > 0.0:
@@ -360,7 +352,10 @@ def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
 
 def _repeats(exchanges: Exchanges, saturation: FloatArray) -> _Repeats:
     """All pairs of consecutive exchanges, without readings near described or estimated saturation."""
-    rows = _rows_of_pairs(exchanges)
+    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
+    _, number = np.unique(pairs, axis=1, return_inverse=True)
+    in_order = np.argsort(number.ravel(), kind="stable")
+    rows = np.split(in_order, np.flatnonzero(np.diff(number.ravel()[in_order])) + 1)
     one, other = (np.concatenate([part[s] for part in rows]) for s in (slice(None, -1), slice(1, None)))
     first, second = exchanges.readings[one, 0], exchanges.readings[other, 0]
     receiver, level = exchanges.receiver[one], 0.5 * (first + second)
@@ -392,9 +387,7 @@ def _noise(platform: IrPlatform, robots: int, repeats: _Repeats) -> FloatArray:
     return found
 
 
-def _unexplained(
-    repeats: _Repeats, sigma: FloatArray, order: NDArray[np.int64]
-) -> tuple[FloatArray, BoolArray]:
+def _unexplained(repeats: _Repeats, sigma: FloatArray, order: IntArray) -> tuple[FloatArray, BoolArray]:
     """Changes not explained by motion, scaled to one reading (p, n, n), and where they are determined.
 
     Args:
@@ -416,7 +409,7 @@ def _unexplained(
     return noise.reshape(sigma.shape), determined.reshape(sigma.shape)
 
 
-def _motions(level: FloatArray, order: NDArray[np.int64]) -> list[FloatArray]:
+def _motions(level: FloatArray, order: IntArray) -> list[FloatArray]:
     """Directions of change of readings (p, n, n) with range, bearing and heading, unnormalized."""
     back = np.argsort(order)
     following, before = order[(back + 1) % len(order)], order[back - 1]

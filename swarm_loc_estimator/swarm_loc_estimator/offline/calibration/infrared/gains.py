@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -69,20 +68,8 @@ def helpful_gains(
         except GainsError:
             continue
         logs[held] = held_out_likelihoods(platform, fit.gains, select(exchanges, held))
-    return _chosen_robots(np.stack([exchanges.receiver, exchanges.transmitter]), logs, blocks, robots)
-
-
-def _chosen_robots(
-    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], robots: int
-) -> BoolArray:
-    """Remove the robot with the least improvement until each remaining one and their sum pass the test.
-
-    Args:
-        pairs: (2, k) receivers and transmitters.
-        logs: (k, H, H) log likelihoods by the hypotheses on both.
-        blocks: (k,) index of the block of time.
-        robots: Number of robots.
-    """
+    # remove the robot with the least improvement until each remaining one and their sum pass the test
+    pairs = np.stack([exchanges.receiver, exchanges.transmitter])
     helps = np.ones(robots, dtype=np.bool_)
     while helps.any():
         own = np.full(robots, np.inf)
@@ -99,7 +86,7 @@ def _chosen_robots(
 
 
 def _by_block(
-    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], helps: BoolArray, judged: BoolArray
+    pairs: IntArray, logs: FloatArray, blocks: IntArray, helps: BoolArray, judged: BoolArray
 ) -> list[FloatArray]:
     """Log-likelihood ratios by block of the estimated gains to each other hypothesis."""
     receiver, transmitter = np.where(helps, GAINS, UNKNOWN)[pairs]
@@ -232,10 +219,8 @@ def calibrate_infrared(
 ) -> InfraredCalibration:
     """Calibrate the gains of all robots with infrared boards; described gains are ignored.
 
-    `with_truth`: whether to use ground truth where it is known.
-
-    Raises:
-        CalibrationError: No exchange can be used, or no gains are determined.
+    `with_truth`: whether to use ground truth where it is known. Raises CalibrationError if no exchange can be
+    used, or no gains are determined.
     """
     groups, dropped = _groups(recording, swarm, with_truth=with_truth)
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
@@ -261,8 +246,7 @@ def calibrate_infrared(
 def exchanges_of(recording: Recording, swarm: Swarm) -> tuple[BoardGroup, IntArray]:
     """The exchanges of the robots with the first kind of board, and their stamps (k,).
 
-    Raises:
-        CalibrationError: No exchange can be used.
+    Raises CalibrationError if no exchange can be used.
     """
     (group, stamps_ns), *_ = _groups(recording, swarm, with_truth=True)[0]
     return group, stamps_ns
@@ -307,8 +291,7 @@ def _groups(
 ) -> tuple[list[tuple[BoardGroup, IntArray]], Counter[str]]:
     """Exchanges by kind of board with their stamps, and the number of unusable matrices by reason.
 
-    Raises:
-        CalibrationError: No matrix can be used.
+    Raises CalibrationError if no matrix can be used.
     """
     screening = MatrixScreening(swarm)
     if not screening.boards:
@@ -371,17 +354,17 @@ def _with_fits(
                 why = "What they read contradicts itself or the ground truth"
             elif not board.helps[place]:
                 why = "Gains do not help in exchanges that they were not estimated from"
-            alive = _without_dead(robots[index], board.elements, place)
-            changed[index] = alive if why else _with_gains(alive, gains)
+            changed[index] = _with_fit(robots[index], board, place, with_gains=not why)
             if why:
                 left.setdefault(why, []).append(robots[index].name)
     return tuple(changed), left
 
 
-def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
-    """The robot with its dead elements; an element described as dead stays so unless it certainly works."""
+def _with_fit(robot: Robot, board: BoardFit, place: int, *, with_gains: bool) -> Robot:
+    """The robot with gains and dead elements; one described as dead stays so unless it certainly works."""
     if robot.ir is None:
         return robot
+    elements, gains = board.elements, board.fit.gains[place]
     described = (robot.ir.dead_sensors, robot.ir.dead_emitters)
     dead = [
         tuple(sorted({*found, *(k for k in before if not works[k])}))
@@ -389,15 +372,11 @@ def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
             elements.numbers(place), described, elements.works[:, place], strict=True
         )
     ]
-    return replace(robot, ir=replace(robot.ir, dead_sensors=dead[0], dead_emitters=dead[1]))
-
-
-def _with_gains(robot: Robot, gains: IrGains) -> Robot:
-    if robot.ir is None:
-        return robot
+    alive = replace(robot.ir, dead_sensors=dead[0], dead_emitters=dead[1])
     sensor, emitter = (tuple(round(v, _DECIMALS) for v in part) for part in (gains.sensor, gains.emitter))
     own, common = (round(sigma, _DECIMALS) for sigma in (gains.sigma, gains.common_sigma))
-    return replace(robot, ir=replace(robot.ir, gains=IrGains(sensor, emitter, own, common)))
+    calibrated = replace(alive, gains=IrGains(sensor, emitter, own, common))
+    return replace(robot, ir=calibrated if with_gains else alive)
 
 
 def _counts(dropped: Counter[str]) -> str:
