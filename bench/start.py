@@ -41,7 +41,7 @@ def _replayed(folder: Path) -> tuple[float, float]:
 def _ready(folder: Path) -> tuple[float, float]:
     """Until a node says that it is ready."""
     begun = time.monotonic()
-    node = [folder / "run", "swarm_loc_estimator", "estimator_node", "--ros-args"]
+    node = [str(folder / "run"), "swarm_loc_estimator", "estimator_node", "--ros-args"]
     node += ["-p", f"swarm_file:={_BAG / 'swarm.yaml'}"]
     with subprocess.Popen(node, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         is_ready = any(_READY in line for line in process.stdout or ())

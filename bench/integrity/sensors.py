@@ -402,8 +402,8 @@ def _among_anchors(seed: int) -> tuple[LivedRun, RangeRows]:
     for k, pose in enumerate(truth[0] + 0.05 * rng.standard_normal((_RADIOS, 3))):
         x, y, theta = pose.tolist()
         radio = UwbDevice(k + 1, z=_ANTENNA_Z, range_sigma=_RANGE_SIGMA)
-        placed = {"start": (x, y, theta), "start_sigma": sigma}
-        robots.append(Robot(f"robot_{k}", odometry=model, camera=None, uwb=radio, **placed))
+        one = Robot(f"robot_{k}", odometry=model, camera=None, uwb=radio)
+        robots.append(replace(one, start=(x, y, theta), start_sigma=sigma))
     swarm = Swarm(
         tuple(robots),
         anchors=tuple(Anchor(100 + k, *place, range_bias_sigma=0.0) for k, place in enumerate(_ANCHORS)),

@@ -9,7 +9,7 @@ the truth, so they contain those of the map.
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -87,7 +87,7 @@ def _figures(runs: Sequence[LidarRun]) -> dict[str, float]:
     return found
 
 
-def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
+def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     """Figures of all halls with both maps, and of wrong starts."""
     figures: dict[str, float] = {}
     cpu_ms: list[float] = []

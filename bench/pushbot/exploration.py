@@ -114,8 +114,8 @@ class KinematicPushBot:
         self.bumps += free < count
         ahead = np.array([math.cos(self._odometry[2]), math.sin(self._odometry[2]), 0.0])
         if self._noise.held and self._rng.random() < self._noise.held:  # half of them from the beginning
-            moves = min(free, int(self._rng.uniform(-count, count)))
-            poses = np.vstack([self.pose, poses])[np.clip(np.arange(1, count + 1), 0, max(0, moves))]
+            last = max(0, min(free, int(self._rng.uniform(-count, count))))
+            poses = np.vstack([self.pose, poses])[np.minimum(np.arange(1, count + 1), last)]
             free = count
         poses = poses[: max(free, 1)] if free else self.pose[None]
         reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)

@@ -220,7 +220,7 @@ def moved_place(body: Surveyed, correction: FloatArray) -> FloatArray:
     That is x, y and yaw, of an anchor the bias in place of the yaw.
     """
     if isinstance(body, Anchor):
-        return correction + np.array([body.x, body.y, body.range_bias])
+        return np.add(correction, (body.x, body.y, body.range_bias), dtype=float)
     return compose(correction, [body.x, body.y, body.yaw or 0.0])
 
 

@@ -170,10 +170,13 @@ def placed(solution: Solution, shared: SharedError) -> Swarm:
             found.append(found_at(body, solution.place[index], covariance[index], shared.place[index]))
         elif np.isfinite(solution.place[index]).all():
             found.append(body)
-    marks, anchors, cameras = (
-        tuple(one for one in found if isinstance(one, kind)) for kind in (Landmark, Anchor, FixedCamera)
+    return replace(
+        swarm,
+        landmarks=tuple(one for one in found if isinstance(one, Landmark)),
+        anchors=tuple(one for one in found if isinstance(one, Anchor)),
+        cameras=tuple(one for one in found if isinstance(one, FixedCamera)),
+        map_error=shared.error,
     )
-    return replace(swarm, landmarks=marks, anchors=anchors, cameras=cameras, map_error=shared.error)
 
 
 class ParameterPrior(NamedTuple):
