@@ -20,6 +20,7 @@ from functools import partial
 from swarm_loc_estimator.common import command_line as cli
 from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.offline.batch.problem import moved
 from swarm_loc_estimator.offline.calibration.fit import calibrate
 from swarm_loc_estimator.offline.calibration.models import EVALUATIONS, Options
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
@@ -55,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
         recording = joined([read_recording(bag, swarm, progress, remap, truth) for bag in options.bag])
         done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {recording.name}. {done.warning}".rstrip())
-    print("\n".join([text_of(done), *recording.sentences()]))
+    print("\n".join([text_of(done), *moved(swarm, done.swarm), *recording.sentences()]))
     unused = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
     said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in unused.items() if count)
     if said:

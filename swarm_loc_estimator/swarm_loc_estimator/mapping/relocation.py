@@ -98,9 +98,8 @@ class Search:
                 before, predicted = self.poses[:, -1], compose(self.poses[:, -1], self.since)
                 self._append(view, predicted, (predicted - before)[:, :2])
                 best = self.poses[int(self._totals().argmax())]
-                if (
-                    math.dist(best[-1, :2], best[-2, :2]) < _NEW_PLACE
-                ):  # the same place: its newest scan counts
+                if math.dist(best[-1, :2], best[-2, :2]) < _NEW_PLACE:
+                    # the same place: its newest scan counts
                     self.poses, self.fits = np.delete(self.poses, -2, 1), np.delete(self.fits, -2, 1)
                     self.known, self.stops = np.delete(self.known, -2, 1), self.stops[:-1]
             self.stops.append(stop)

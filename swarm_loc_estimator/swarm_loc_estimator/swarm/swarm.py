@@ -81,6 +81,11 @@ class Anchor(Radio, StaticBody):
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range to this anchor")
     range_bias_sigma: float = estimated(0.2, "m", 10.0, "range_bias")
 
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return f"anchor {self.address}"
+
 
 Pose2 = tuple[float, float, float]  # x [m], y [m], heading [rad]
 
@@ -130,6 +135,11 @@ class Landmark(StaticBody):
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
     position_sigma: float = estimated(0.0, "m", 100.0, "x and y")
     yaw_sigma: float = estimated(0.0, "rad", 10.0, "yaw")
+
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return f"landmark {self.id}"
 
 
 @dataclass(frozen=True)
@@ -191,6 +201,11 @@ class FixedCamera(StaticBody):
     position_sigma: float = positive(0.001, "m", 10.0, "standard deviation of x and y, always estimated")
     yaw_sigma: float = positive(0.002, "rad", 1.0, "standard deviation of yaw, always estimated")
     sensor: models.SensorModel = field(default=models.SensorModel(), metadata=entry(_SENSOR))
+
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return self.name
 
 
 Surveyed = Landmark | Anchor | FixedCamera  # A static body whose place may be estimated
@@ -283,7 +298,7 @@ class Swarm:
             what = "two robots or cameras, which must differ by more than capitals"
             raise SwarmError(f"name '{twice[0]}' is given to {what}.")
         faces = [(f"face '{f.name}' of robot '{r.name}'", f.id) for r in self.robots for f in r.faces]
-        marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
+        marks = [(mark.title, mark.id) for mark in self.landmarks]
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
         radios = [(f"robot '{r.name}'", r.uwb.address) for r in self.robots if r.uwb is not None]
         radios += [(f"anchors[{k}]", anchor.address) for k, anchor in enumerate(self.anchors)]

@@ -253,9 +253,7 @@ def contradictions(
     now_ns: int,
 ) -> list[Contradiction]:
     """All faults detected at an instant; `unmoved` (N,) move although their odometry has never changed."""
-    names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
-    names += [f"anchor {anchor.address}" for anchor in swarm.anchors]
-    names += [camera.name for camera in swarm.cameras]
+    names = [robot.name for robot in swarm.robots] + [body.title for body in swarm.surveyed]
     robots, belief, maps = len(swarm.robots), state.arrays(), swarm.map is not None
     names += [f"{'lidar' if maps and one.lidar.is_used else 'fixes'} of {one.name}" for one in swarm.robots]
     names += [f"marker of {one.name}" for one in swarm.robots]

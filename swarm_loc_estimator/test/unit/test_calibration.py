@@ -466,9 +466,12 @@ def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone(tmp_p
     stiff = replace(wrong, odometry=OdometryModel(wheel_noise=2e-5))
     begin = replace(swarm, robots=(stiff,))
     is_better, said = refined([recording.messages], begin, tmp_path / "swarm.yaml")
-    assert is_better  # the half that begins where nobody has described is fitted, too
+    assert is_better, said  # the half that begins where nobody has described is fitted, too
     found = load_swarm(tmp_path / "swarm.refined.yaml")
-    assert "which stays in use.\nCorrected for robot1: " in said
+    held_out = r"which stays in use\.\nHeld-out check: .* scatter (\S+) times as much as with the old desc"
+    (ratio,) = re.findall(held_out, said)
+    assert 0.0 < float(ratio) < 0.5
+    assert "\nCorrected for robot1: " in said
     before, after = (score([rerun(recording, one, TICK_S)]).position_rmse for one in (begin, found))
     assert after < 0.3 * before
 

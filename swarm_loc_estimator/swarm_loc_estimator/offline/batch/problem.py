@@ -137,6 +137,22 @@ def corrections(before: Swarm, found: Swarm, parameters: Sequence[Parameter]) ->
     return lines
 
 
+def moved(before: Swarm, found: Swarm) -> list[str]:
+    """A sentence for each described body that was found elsewhere."""
+    lines = []
+    for old, new in zip(before.surveyed, found.surveyed, strict=True):
+        pairs = ((key, getattr(old, key, None), getattr(new, key, None)) for key in _PLACE)
+        said = [
+            f"{key} {a:.4f} -> {b:.4f}" for key, a, b in pairs if a is not None and b is not None and a != b
+        ]
+        if said:
+            lines.append(f"Placed {new.title}: {', '.join(said)}.")
+    return lines
+
+
+_PLACE = ("x", "y", "yaw", "range_bias")
+
+
 def all_changed(swarm: Swarm, parameters: Sequence[Parameter], change: FloatArray) -> Swarm:
     """The swarm with parameters of its robots changed by (N, p), within the ranges of a description."""
     robots = [_changed(robot, parameters, row) for robot, row in zip(swarm.robots, change, strict=True)]

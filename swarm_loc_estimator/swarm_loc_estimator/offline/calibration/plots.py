@@ -48,7 +48,7 @@ def text_of(done: Calibration) -> str:
             _line("estimator, NEES (ideal 3)", done.before.nees, done.after.nees),
         ]
     lines += [f"{name} = {value:g}" for name, value in done.noise.items()]
-    return "\n".join([*lines, *done.models.remarks, *([done.warning] if done.warning else [])])
+    return "\n".join([*lines, *done.models.remarks, *filter(None, (done.gain, done.warning))])
 
 
 def draw(done: Calibration, path: Path) -> Path:
