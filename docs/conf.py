@@ -8,8 +8,6 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sphinx.pycode import ModuleAnalyzer
-
 import swarm_loc_estimator
 from swarm_loc_estimator.common.parameters import number_specs
 
@@ -99,6 +97,8 @@ def _prepare_docstring(_app: Sphinx, what: str, name: str, obj: Any, _options: A
     if lines and lines[0].startswith("Alias for field number"):
         lines.clear()
     if what == "data":  # autodoc would take the docstring of its type: the API loads it from another module
+        from sphinx.pycode import ModuleAnalyzer  # noqa: PLC0415 the tests read this file without Sphinx
+
         constant = name.rpartition(".")[2]
         of_module = ModuleAnalyzer.for_module(vars(swarm_loc_estimator)["_MODULE_OF"][constant])
         lines[:] = of_module.find_attr_docs().get(("", constant), [])

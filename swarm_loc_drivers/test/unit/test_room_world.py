@@ -12,12 +12,16 @@ import pytest
 from bench.shared.parameter_table import markdown_table
 from bench.shared.room_run import placed_world, record_room
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, clearance
-from swarm_loc_drivers.sim.room.sensors import Lidar, Radios, sensors_of
+from swarm_loc_drivers.sim.room.sensors import CeilingCameras, Lidar, Radios, sensors_of
 from swarm_loc_drivers.sim.room.world import STEP_NS, RoomWorldParameters, drawn, room_of, room_starts
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.cli import new
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.messages.cdr import RANGE, decode
 from swarm_loc_estimator.mapping.messages import decode_scan
+from swarm_loc_estimator.offline.calibration.models import Options, fit_models
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Localizer, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -149,3 +153,26 @@ def test_a_description_by_new_locates_simulated_robots(tmp_path: Path, options: 
     assert (result.status[-1] == Status.TRACKED).all()
     assert result.overall.position_rmse < error_m
     assert result.overall.nees < 6.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_ceiling_cameras_are_placed_by_robots_that_they_see(tmp_path: Path, seed: int) -> None:
+    """They hang 5 cm and .05 rad off, as described, and no robot sees anything."""
+    swarm = described(tmp_path, "--type", "epuck2", "--robots", "3", "--sensors", "ceiling")
+    world = placed_world(swarm, "w2", seed)
+    (ceiling,) = (one for one in sensors_of(world) if isinstance(one, CeilingCameras))
+    record_room(world, 60.0, tmp_path / "bag")
+    blind = replace(read_recording(tmp_path / "bag", swarm), truth={})
+    found = fit_models(blind, swarm, Options(alone=True), unwatched).swarm
+    hung, placed = (np.array([(one.x, one.y, one.yaw) for one in each.cameras]) for each in (swarm, found))
+    true = hung + ceiling.offsets
+    # where one is as the other has it; of where both are, the description alone tells
+    before, after = (
+        np.abs(se2.between(each[0], each[1]) - se2.between(true[0], true[1])) for each in (hung, placed)
+    )
+    assert before.max() > 0.03
+    assert after.max() < 0.004
+    shared = found.map_error
+    assert shared.position_sigma == pytest.approx(0.05 / np.sqrt(2.0), rel=0.1)
+    assert np.abs((placed - true).mean(axis=0)[:2]).max() < 3.0 * shared.position_sigma
+    assert max(one.position_sigma for one in found.cameras) < 0.005

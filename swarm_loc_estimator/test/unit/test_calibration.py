@@ -10,11 +10,7 @@ import pytest
 from calibration_world import SECOND, World, record, robot
 
 from bench.shared.bags import copy_part
-from bench.shared.room_run import placed_world, record_room
-from swarm_loc_drivers.sim.room.sensors import CeilingCameras, sensors_of
 from swarm_loc_estimator.cli.calibrate import main
-from swarm_loc_estimator.cli.new import main as new
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
@@ -416,32 +412,6 @@ def test_radios_and_gyroscopes_are_fitted_with_the_cameras(seed: int) -> None:
         assert found.imu.turn_bias == pytest.approx(GYRO_BIAS, abs=1e-3)
         assert 0.7 < found.imu.turn_noise_density / GYRO_DENSITY < 1.6
     assert max(abs(found.range_bias) for found in alone.swarm.anchors) < 0.05
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_ceiling_cameras_are_placed_by_robots_that_they_see(tmp_path: Path, seed: int) -> None:
-    """They hang 5 cm and .05 rad off, as described, and no robot sees anything."""
-    assert new(f"{tmp_path}/swarm.yaml --yes --type epuck2 --robots 3 --sensors ceiling".split()) == 0
-    swarm = load_swarm(tmp_path / "swarm.yaml")
-    world = placed_world(swarm, "w2", seed)
-    (ceiling,) = (one for one in sensors_of(world) if isinstance(one, CeilingCameras))
-    record_room(world, 60.0, tmp_path / "bag")
-    blind = replace(read_recording(tmp_path / "bag", swarm), truth={})
-    found = fit_models(blind, swarm, Options(alone=True), quiet).swarm
-    described, placed = (
-        np.array([(one.x, one.y, one.yaw) for one in each.cameras]) for each in (swarm, found)
-    )
-    true = described + ceiling.offsets
-    # where one is as the other has it; of where both are, the description alone tells
-    before, after = (
-        np.abs(se2.between(each[0], each[1]) - se2.between(true[0], true[1])) for each in (described, placed)
-    )
-    assert before.max() > 0.03
-    assert after.max() < 0.004
-    shared = found.map_error
-    assert shared.position_sigma == pytest.approx(0.05 / np.sqrt(2.0), rel=0.1)
-    assert np.abs((placed - true).mean(axis=0)[:2]).max() < 3.0 * shared.position_sigma
-    assert max(one.position_sigma for one in found.cameras) < 0.005
 
 
 def test_a_part_of_a_recording_is_a_part_of_all_its_inputs() -> None:

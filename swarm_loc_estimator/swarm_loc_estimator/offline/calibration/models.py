@@ -258,9 +258,10 @@ def _fitted(
             if solution is not None:
                 robots[index] = _with_own_noise(robots[index], index, found, solution)
     if not motion and not any(fit.is_enough for fit in cameras):
+        truth = "" if options.alone else "ground truth together with "
         raise CalibrationError(
-            f"recording '{recording.name}' holds too little odometry or sightings of robots whose paths are"
-            " known; at least a minute of a moving robot that sees markers or is seen is needed."
+            f"recording '{recording.name}' holds too little {truth}odometry or sightings; at least a minute"
+            " of a moving robot that sees markers or is seen is needed."
         )
     swarm = replace(found.swarm, robots=tuple(robots))
     models = FittedModels(swarm, tuple(cameras), tuple(motion), tuple(remarks), {}, paths)
