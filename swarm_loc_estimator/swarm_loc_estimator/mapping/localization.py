@@ -40,9 +40,9 @@ _MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
 """Maximum shift of a start pose: standard deviations, and in addition [m, rad]."""
 
 
-_HELD_STEP, _HELD_TARGETS, _MIN_HELD_SCORE, _MAX_END = 0.04, 6, 0.5, 0.85
+_HELD_STEP, _HELD_TARGETS, _MIN_HELD_SCORE, _MIN_HELD_GAIN = 0.04, 6, 0.5, 1.0 / 3.0
 """Drives of a body that is held: step of the search along them [m], number of stops near each end that are
-compared, minimum score of the place where it is, and maximum score near the end relative to it."""
+compared, minimum score of the place where it is, and by how much the score near the end is less."""
 
 
 def driven_share(graph: PoseGraph, left: FloatArray, stop: int) -> float:
@@ -64,7 +64,7 @@ def driven_share(graph: PoseGraph, left: FloatArray, stop: int) -> float:
         place[:] = arrival - (1.0 - step / max(1, count)) * (arrival - left)
         scores[step] = score(graph.scans, stop, others, stride)
     best = int(scores.argmax())
-    is_held = scores[best] > _MIN_HELD_SCORE and scores[-3:].max() < _MAX_END * scores[best]
+    is_held = scores[best] > max(_MIN_HELD_SCORE, scores[-3:].max() + _MIN_HELD_GAIN)
     share = best / count if is_held else 1.0
     place[:] = arrival - (1.0 - share) * (arrival - left)
     return share
