@@ -137,6 +137,9 @@ def corrections(before: Swarm, found: Swarm, parameters: Sequence[Parameter]) ->
     return lines
 
 
+_PLACE = ("x", "y", "yaw", "range_bias")  # What tells where a body is
+
+
 def moved(before: Swarm, found: Swarm) -> list[str]:
     """A sentence for each described body that was found elsewhere."""
     lines = []
@@ -148,9 +151,6 @@ def moved(before: Swarm, found: Swarm) -> list[str]:
         if said:
             lines.append(f"Placed {new.title}: {', '.join(said)}.")
     return lines
-
-
-_PLACE = ("x", "y", "yaw", "range_bias")
 
 
 def all_changed(swarm: Swarm, parameters: Sequence[Parameter], change: FloatArray) -> Swarm:

@@ -31,7 +31,6 @@ from swarm_loc_estimator.swarm.calibration_states import (
     shared_error,
 )
 from swarm_loc_estimator.swarm.swarm import (
-    NO_MAP_ERROR,
     Anchor,
     FixedCamera,
     Landmark,
@@ -144,13 +143,16 @@ class SharedError(NamedTuple):
 
 
 def shared_by_places(solution: Solution) -> SharedError:
-    """The error that all places share that were estimated, and what is correlated with their scale."""
+    """The error that all places share that were estimated, and what is correlated with their scale.
+
+    Where too few were estimated to tell it, the described one stays.
+    """
     column, parameters = solution.landmark_column, solution.parameter_column
     is_anchor = np.array([isinstance(one, Anchor) for one in solution.problem.swarm.surveyed], dtype=bool)
     free, anchors = np.flatnonzero((column >= 0) & ~is_anchor), np.flatnonzero((column >= 0) & is_anchor)
     place, by = solution.place[free, :2], np.zeros((column.size, 3, 4))
     if not free.size or not np.ptp(place, axis=0).any():
-        return SharedError(NO_MAP_ERROR, by, np.zeros(parameters.shape))
+        return SharedError(solution.problem.swarm.map_error, by, np.zeros(parameters.shape))
     unknowns = [_three(column[free]).ravel(), _three(column[anchors]).ravel(), parameters.ravel()]
     covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(np.concatenate(unknowns))
     error, by[free], others = shared_error(place, covariance)
