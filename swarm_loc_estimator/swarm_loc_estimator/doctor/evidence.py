@@ -144,11 +144,34 @@ class Evidence:
 
     @cached_property
     def estimated(self) -> Estimated:
-        """What the estimator makes of all readings."""
+        """What the estimator makes of all readings.
+
+        A description is contradicted only if each half of the recording contradicts it, too: what repeats
+        for a while, as the error of a camera from one place, looks like another place of a landmark.
+        """
+        parts = self.converted[0]
+        begin_ns, end_ns = (parts[0].begin_ns, parts[-1].end_ns) if parts else (0, 0)
         # without starts that robots had left before they were heard
+        starts = [self.is_at_start(index) for index in range(len(self.swarm.robots))]
+        whole = self._estimated(begin_ns, end_ns, starts)
+        doubted = {one.about for one in whole.contradictions if one.kind is Contradicted.DESCRIPTION}
+        middle_ns, nowhere = (begin_ns + end_ns) // 2, [False] * len(starts)
+        for begin, end, known in ((begin_ns, middle_ns, starts), (middle_ns, end_ns, nowhere)):
+            if doubted:
+                half = self._estimated(begin, end, known).contradictions
+                doubted &= {one.about for one in half if one.kind is Contradicted.DESCRIPTION}
+        contradictions = [
+            one
+            for one in whole.contradictions
+            if one.kind is not Contradicted.DESCRIPTION or one.about in doubted
+        ]
+        return whole._replace(contradictions=contradictions)
+
+    def _estimated(self, from_ns: int, until_ns: int, starts: Sequence[bool]) -> Estimated:
+        """What the estimator makes of what arrived between two instants, by those starts (N,)."""
         described = [
-            robot if self.is_at_start(index) else replace(robot, start=None)
-            for index, robot in enumerate(self.swarm.robots)
+            robot if is_there else replace(robot, start=None)
+            for robot, is_there in zip(self.swarm.robots, starts, strict=True)
         ]
         estimator, robots = Estimator(replace(self.swarm, robots=tuple(described)), SETTINGS), len(described)
         ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
@@ -158,6 +181,8 @@ class Evidence:
             stamps_ns = np.arange(part.begin_ns + _TICK_NS, part.end_ns, _TICK_NS)
             ends_ns = [*stamps_ns.tolist(), part.end_ns]
             for now_ns, arrived in zip(ends_ns, part.until_each(stamps_ns), strict=True):
+                if not from_ns < now_ns <= until_ns:
+                    continue
                 count += 1
                 estimator.receive(arrived)
                 estimate = estimator.tick(now_ns)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ from wrong_setups import (
     SEEN,
     WRONG,
     Change,
+    edited,
     farther,
     good,
+    landmark_elsewhere,
     shifted,
     with_gyroscope,
+    with_swarm,
     with_topics,
 )
 
@@ -76,6 +80,20 @@ def test_a_camera_is_not_accused_by_one_half_of_a_recording() -> None:
     mixed = with_topics(heard, epuck2__detections=replace(heard.topics[SEEN], messages=messages))
     assert not [one for one in examine(mixed) if "times as far" in one.problem]
     assert [one for one in examine(changed) if "times as far" in one.problem]
+
+
+def test_a_landmark_is_not_accused_by_one_half_of_a_recording() -> None:
+    heard = with_swarm(landmark_elsewhere)(good(seconds=50.0))
+    middle_ns = heard.end_ns - 25_000_000_000
+    number = heard.swarm.landmarks[0].id
+    seen = [name for name in heard.topics if name.endswith("detections")]
+
+    def see_late(message: Any, arrival_ns: int) -> None:
+        message.detections = [one for one in message.detections if arrival_ns > middle_ns or one.id != number]
+
+    about = f"landmark {number}"
+    assert any(one.about == about for one in examine(heard))
+    assert not any(one.about == about for one in examine(edited(seen, see_late)(heard)))
 
 
 def test_the_command_prints_findings(capsys: pytest.CaptureFixture[str]) -> None:
