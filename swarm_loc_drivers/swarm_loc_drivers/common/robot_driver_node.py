@@ -101,8 +101,7 @@ def camera_info_message(calibration: CameraCalibration, header: Header) -> Camer
 
 
 _COMMAND_QOS = QoSProfile(depth=1)
-_CLOCK_PATIENCE_S = 30.0
-"""Silence about a simulation that is starting: its nodes may take long on a busy machine."""
+_CLOCK_PATIENCE_S = 30.0  # Silence about a simulation that starts: its nodes may take long on a busy machine
 
 
 Parameters = TypeVar("Parameters", bound=DriverParameters)

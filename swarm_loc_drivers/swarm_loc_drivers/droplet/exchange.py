@@ -29,8 +29,7 @@ from swarm_loc_drivers.droplet.hardware import (
 from swarm_loc_drivers.droplet.protocol import MARGIN_NS, ConsoleTalk, Matrix, Said, SendAborted, Talk, relay
 from swarm_loc_estimator.common.arrays import IntArray
 
-_BRIGHTER = 1.5
-"""Least ratio of the sums of the far and the near matrix of a pair, at any distance up to 30 cm."""
+_BRIGHTER = 1.5  # Least ratio of the sums of the far and the near matrix of a pair, up to 30 cm apart
 _PATIENCE_NS = 100_000_000  # Tolerance for the arrival of a matrix [ns]
 _MAX_SKIPPED = 32  # Most turns after which an unreachable robot is asked again
 _MAX_BACKOFF_S = 0.3

@@ -20,8 +20,7 @@ _TICK_S = 1.024e-3
 _ON_TICKS, _OFF_TICKS, _TRIMS_PER_TICK = 20, 40, 32
 _UNCALIBRATED = 0xFFFF - 1000
 """An unwritten EEPROM holds 0xFFFF; the firmware treats values near it as uncalibrated."""
-_UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000
-"""Values that the firmware then uses, per 1000 steps."""
+_UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000  # The firmware then uses these, per 1000 steps
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from typing import Protocol
 from typing_extensions import Self
 
 _CHUNK = 4096
-_MAX_CLIENTS = 9
-"""Number of client sockets: the firmware never closes one, and has ten including the server's."""
+_MAX_CLIENTS = 9  # The firmware never closes a client socket, and has ten including the server
 
 
 class ConsoleFirmware(Protocol):

@@ -149,23 +149,17 @@ class Evidence:
         A description is contradicted only if each half of the recording contradicts it, too: what repeats
         for a while, as the error of a camera from one place, looks like another place of a landmark.
         """
-        parts = self.converted[0]
+        parts, kind = self.converted[0], Contradicted.DESCRIPTION
         begin_ns, end_ns = (parts[0].begin_ns, parts[-1].end_ns) if parts else (0, 0)
         # without starts that robots had left before they were heard
         starts = [self.is_at_start(index) for index in range(len(self.swarm.robots))]
         whole = self._estimated(begin_ns, end_ns, starts)
-        doubted = {one.about for one in whole.contradictions if one.kind is Contradicted.DESCRIPTION}
-        middle_ns, nowhere = (begin_ns + end_ns) // 2, [False] * len(starts)
-        for begin, end, known in ((begin_ns, middle_ns, starts), (middle_ns, end_ns, nowhere)):
-            if doubted:
-                half = self._estimated(begin, end, known).contradictions
-                doubted &= {one.about for one in half if one.kind is Contradicted.DESCRIPTION}
-        contradictions = [
-            one
-            for one in whole.contradictions
-            if one.kind is not Contradicted.DESCRIPTION or one.about in doubted
-        ]
-        return whole._replace(contradictions=contradictions)
+        middle_ns, named = (begin_ns + end_ns) // 2, whole.contradictions
+        for half in ((begin_ns, middle_ns, starts), (middle_ns, end_ns, [False] * len(starts))):
+            if any(one.kind is kind for one in named):
+                agreed = {one.about for one in self._estimated(*half).contradictions if one.kind is kind}
+                named = [one for one in named if one.kind is not kind or one.about in agreed]
+        return whole._replace(contradictions=named)
 
     def _estimated(self, from_ns: int, until_ns: int, starts: Sequence[bool]) -> Estimated:
         """What the estimator makes of what arrived between two instants, by those starts (N,)."""

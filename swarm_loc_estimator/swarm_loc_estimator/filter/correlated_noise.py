@@ -515,8 +515,7 @@ def _carry_excess(excess: FloatArray, left: FloatArray, added: FloatArray, weigh
 RADIO_LENGTH_M = 0.5  # Motion of an antenna after which the correlation of errors is 1/e
 _LEAST_REPEATED, _MOST_REPEATED, _LEARNING, _LARGEST = 0.3, 0.9, 1.0 / 64.0, 9.0
 """Least and largest share of their variance that repeats, and weight and limit of a squared difference."""
-_STILL_M, _NEAR_M = 0.03, 0.15
-"""Antennas that have moved less have not moved, or see almost the same errors [m]."""
+_STILL_M, _NEAR_M = 0.03, 0.15  # Antennas that have moved less stand, or see almost the same errors [m]
 _LEAST_NEWS = 1e-6  # Least part of the information of a range that is new
 _SPENT, _PLACES, _WHITE, _INNOVATION, _VARIANCE = 1, 2, 7, 8, 9
 """What else `last_look` has of two radios, see `SourceArrays`."""

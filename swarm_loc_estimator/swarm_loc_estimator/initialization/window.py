@@ -57,8 +57,7 @@ _HEADINGS = 8
 _MAX_HYPOTHESES = 8
 _FIRST_STEPS, _STEPS = 10, 15
 _ROBUST = 2.0  # Residual in standard deviations from which measurements are down-weighted (Cauchy)
-_TRUNCATED = 9.0
-"""Squared residual in units of its variance from which a measurement disagrees and costs no more."""
+_TRUNCATED = 9.0  # Squared residual, in variances, from which a measurement disagrees and costs no more
 _MIN_SHARE = 0.65  # Share of the measurements that must agree
 _MIN_LINKS, _FEW_SHARE, _FEW_NS = 3, 0.85, 8_000_000_000
 """With fewer links, more must agree for longer: two too long ranges can agree with each other."""

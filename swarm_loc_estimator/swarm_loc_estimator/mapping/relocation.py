@@ -28,8 +28,7 @@ _NEAREST = 0.15  # Walls nearer than this may not be seen [m]
 _NEW_PLACE = 0.2  # Minimum distance of stops whose scans count separately [m]
 _SHIFT, RATES = np.array([0.5, math.radians(15.0)]), np.array([0.3, 3.0])
 """How far a robot is moved by hands [m, rad], and how fast it moves by itself [m/s, rad/s]."""
-_APART = np.array([0.15, math.radians(8.0)])
-"""Distance [m] or turn [rad] from which a place is another one."""
+_APART = np.array([0.15, math.radians(8.0)])  # Distance [m] or turn [rad] from which a place is another one
 _STEP, _TURN_STEP = 0.1, math.radians(3.0)  # Of the places that are tried first [m], [rad]
 _FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
 """Of the places around these, and of those after each drive [m, rad], and their number to each side."""

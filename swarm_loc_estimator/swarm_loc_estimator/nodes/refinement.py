@@ -18,11 +18,9 @@ from swarm_loc_estimator.common.processes import end_with, uninterrupted
 from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-KEPT_S, KEPT_BYTES = 300.0, 64_000_000
-"""Time and memory from which on no more inputs are kept."""
+KEPT_S, KEPT_BYTES = 300.0, 64_000_000  # Time and memory from which on no more inputs are kept
 _SENSORS = ("odometry", "imu", "detections", "ranges")
-Answer = tuple[bool, str]
-"""Whether a description was written, and what to say."""
+Answer = tuple[bool, str]  # Whether a description was written, and what to say
 
 
 class Refinement:

@@ -183,8 +183,7 @@ BEFORE_ALL_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
 """Record of the numbers of an `OdometryModel`."""
-IMU_DTYPE = np.dtype([(f.name, np.float64) for f in fields(ImuModel)])
-"""Record of the numbers of an `ImuModel`."""
+IMU_DTYPE = np.dtype([(f.name, np.float64) for f in fields(ImuModel)])  # Record of the numbers of `ImuModel`
 
 
 class TrackArrays(NamedTuple):

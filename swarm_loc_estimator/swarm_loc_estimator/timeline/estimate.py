@@ -142,8 +142,7 @@ def _status(
     return _UNCERTAIN if turns or max(xx, yy) > limits.position_sigma**2 else _TRACKED
 
 
-_MOVES = 3
-"""Number of moves that prove motion; one or two may be the correction of a wrong start or calibration."""
+_MOVES = 3  # Number of moves that prove motion; one or two may correct a wrong start or calibration
 _MOVE_M, _MOVE_SIGMAS = 0.05, 3.0
 """Minimum displacement of a move: a length, and a multiple of the standard deviation of both ends."""
 _MEMORY_NS = 30_000_000_000  # Time within which these moves happen, and for which they are remembered

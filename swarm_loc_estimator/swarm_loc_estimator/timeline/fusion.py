@@ -45,10 +45,8 @@ from swarm_loc_estimator.timeline.robots_in_scans import RobotsInScans
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import middle_of_period
 
-_SURER_AT_FIRST = 1.5
-"""`lost_heading_sigma` over the maximum standard deviation of the heading at initialization."""
-_PAIRS_PER_ROBOT = 32
-"""Maximum number of observed robots per robot with a stored mean of infrared measurements."""
+_SURER_AT_FIRST = 1.5  # `lost_heading_sigma` over the greatest sigma of the heading at initialization
+_PAIRS_PER_ROBOT = 32  # Maximum number of observed robots per robot with a mean of infrared measurements
 _SETTLING_NS = 10_000_000_000  # A camera that is contradicted again so soon is suspended
 _AT_ONCE_NS, _MANY = 60_000_000_000, 3
 """If so many exact landmarks are contradicted within this time, the description is wrong as a whole."""

@@ -167,8 +167,7 @@ _ALONG = 0.92
 """Least cosine of the angle between the slope of brightness at an edge and the normal of the outline."""
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
-_EVERY, _LIKELY = 4, 0.4
-"""Candidates are first tested on every fourth ray; this share of them must meet an edge."""
+_EVERY, _LIKELY = 4, 0.4  # Candidates are first tested on every fourth ray; this share must meet an edge
 _MIN_RAYS = 12
 _NOISES = 0.5  # Least step of an edge over the noise of one pixel: its two sides are means over many pixels
 _TOGETHER = 3.0  # Neighbouring rays that share pixels, and so one error

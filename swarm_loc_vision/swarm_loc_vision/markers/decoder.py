@@ -29,8 +29,7 @@ _SHARPENING = 0.2  # Share of the difference to each of its four neighbours that
 _MAX_DARK_ERRORS = 3.0
 """Maximum number of light cells among those of the border's inner ring, which are 16 or more."""
 _MAX_SLOPE = 0.5  # Maximum difference of the border's brightness between its sides, relative to the contrast
-_MIDDLE, _LOW = 0.5, 0.28
-"""Thresholds between ink and paper: the default, and one for a marker half in shadow."""
+_MIDDLE, _LOW = 0.5, 0.28  # Between ink and paper: the default, and that of a marker half in shadow
 _MIN_CORRELATION = 0.4
 """Minimum correlation of a candidate and its word. A black square with a speck of light has cells near the
 threshold that fit any word at little cost; it reaches 0.37, moving markers 0.5 and more."""

@@ -26,10 +26,8 @@ _DARK = 255
 _FOLLOWED = 1  # Value of a dark pixel on a followed outline whose left neighbour is light
 _SAME = 0.15  # Maximum distance of duplicate quadrangles, relative to their size
 # Limits of outlines: checked by the recall of `make bench-vision` and by test_detector.py.
-_NOISE_SIGMAS = 1.25
-"""Minimum ratio of contrast to noise; below it, specks of noise would dominate the run time."""
-_SMOOTHING_PX = 0.5
-"""Standard deviation of the blur that keeps outlines connected; more would close narrow cells."""
+_NOISE_SIGMAS = 1.25  # Minimum ratio of contrast to noise; below it, specks would dominate the run time
+_SMOOTHING_PX = 0.5  # Sigma of the blur that keeps outlines connected; more would close narrow cells
 _NOISE_ROWS = 16  # The noise is measured in every 16th row
 _DEVIATION = 0.75  # Standard deviation of noise, blurred as above, over the median of its second differences
 _MIN_AREA = 0.6  # Minimum area of a quadrangle over the square of the minimum side
@@ -45,8 +43,7 @@ _ACROSS, _DOWN = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, -1, -1, -1,
 _LEFT = 4  # Index of the direction to the left
 _LONGEST_OUTLINE = 4  # Maximum number of points of an outline, relative to height plus width of the image
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-WINDOWS = ((7, 25), (35,))
-"""Sides of the neighbourhoods of the local mean [px], in full and in half resolution."""
+WINDOWS = ((7, 25), (35,))  # Sides of the neighbourhoods of local means [px], in full and in half resolution
 
 
 def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bool = False) -> FloatArray:

@@ -215,8 +215,7 @@ def _collect_side(
     found.first[k + 1] = m
 
 
-_ENDS = 8
-"""The first parameters: distance of each line outside of its side at the first and the last corner [px]."""
+_ENDS = 8  # The first parameters: distance of each line outside of its side at both corners [px]
 _DARK, _CONTRAST, _LIGHT_X, _LIGHT_Y, _BLUR_XX, _BLUR_YY, _BLUR_XY = range(_ENDS, _ENDS + 7)
 _PARAMETERS = _ENDS + 7
 _SLOPES = 7  # Derivatives of a pixel: by the two ends of its side, by what all sides share, by blur across it

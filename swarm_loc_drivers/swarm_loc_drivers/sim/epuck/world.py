@@ -40,8 +40,7 @@ from swarm_loc_vision.markers.families import families
 GrayImage = NDArray[np.uint8]
 
 STEP_NS = 5_000_000
-OVERHEAD = -1
-"""In place of a robot: the overhead camera, which stamps its images with the middle of the exposure."""
+OVERHEAD = -1  # In place of a robot: the overhead camera, which stamps its images in the middle of exposure
 _SLIP_S = 0.05  # How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s
 _KEPT_NS = 400_000_000  # An image can be drawn for this time after its camera has taken the next one
 _PHASES, _EXPOSURES, _SENSOR, _PROXIMITY, _OVERHEAD_SENSOR = range(5)

@@ -30,8 +30,7 @@ from swarm_loc_estimator.common.parameters import ParameterError, choice, number
 from swarm_loc_estimator.swarm.swarm import Pose2, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
-_FREE_RATE = 6000.0
-"""A wheel at full voltage [ticks/s]; the firmware's fastest velocity needs four fifths of it."""
+_FREE_RATE = 6000.0  # A wheel at full voltage [ticks/s]; the fastest velocity needs four fifths of it
 _LAG_S = 0.02
 
 

@@ -29,8 +29,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.swarm.swarm import CameraMount
 from swarm_loc_vision.common.camera import CX, CY, FX
 
-STEP_PX = 1.0
-"""An image is drawn at as many instants of its exposure as keep the motion between them below this."""
+STEP_PX = 1.0  # Maximum motion between the instants of an exposure at which an image is drawn
 MAX_INSTANTS = 256
 
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

@@ -178,8 +178,7 @@ def derived_by(
     return [*out, Derived(numbers[[0, 1, -1]], weights.T.copy(), rest)]
 
 
-_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
-"""Variance of a copy given its body [m^2], [m^2], [rad^2]."""
+_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))  # Variance of a copy given its body [m^2, m^2, rad^2]
 _PANELS = 4  # Number of panels of a product
 
 

@@ -177,8 +177,7 @@ def _changed(robot: Robot, parameters: Sequence[Parameter], change: FloatArray) 
 
 
 STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
-MAX_KNOTS = 12_000
-"""Maximum number of these instants, of all robots; those of long recordings are farther apart."""
+MAX_KNOTS = 12_000  # Maximum number of these instants, of all robots; those of long bags are farther apart
 _MOMENT_NS = 1_000_000  # Time over which a speed is measured
 _WITH_POSE = (CONTENT_POSE, CONTENT_POSE_TWO)
 MIN_SIGHTINGS = 5  # Minimum number of sightings of a marker that is to be a landmark

@@ -39,8 +39,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
-MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
-"""Longest time between two knots, and largest number of knots times robots."""
+MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000  # Longest time between two knots, and most knots times robots
 _FIXED = 1e-6  # Standard deviation of a parameter that is exact
 _CONTRADICTED = 0.5  # Weight below which the batch contradicts a measurement
 _CONTRADICTING = 0.15  # Share of the measurements of a robot or camera from which they contradict the others

@@ -60,8 +60,7 @@ _HEADING_WEIGHT = 0.2
 _SPACING_NS = 50_000_000  # Odometry is thinned out to this spacing for speed
 _INCONSISTENCY = 0.2  # A NEES of half or twice its aim costs as much as 10 % more error
 _LOSS = 5.0  # A hundredth of the poses missing costs as much as 5 % more error
-_FORGETTING = 0.005
-"""Weight of the prior that parameters stay near their initial values, per squared factor of e."""
+_FORGETTING = 0.005  # Weight of the prior that parameters stay near where they began, per squared factor of e
 _FIRST_STEP, _LAST_STEP = 0.7, 0.07  # Trust radii of the search, in logarithms of the noise
 _BETTER = 0.97  # Scatter of held-out sightings that is asked of a fit without ground truth, per described one
 _MISSED = 0.1  # Share of the poses that a description without ground truth may cost

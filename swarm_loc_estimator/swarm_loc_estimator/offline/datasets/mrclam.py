@@ -229,8 +229,7 @@ def _nanoseconds(time_s: FloatArray) -> IntArray:
 
 
 ROBOT_TYPE = "create"
-TIMEOUT_S = 2.0
-"""The logs pause for just over a second about every two minutes, while the robots keep driving."""
+TIMEOUT_S = 2.0  # The logs pause for over a second about every two minutes, while the robots keep driving
 _COMMANDED = OdometryModel(
     wheel_separation=0.258,
     timeout_s=TIMEOUT_S,

@@ -53,8 +53,7 @@ _STEP = 1e-5
 _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
 _MIN_MEASURED = 100  # Minimum number of exchanges of a receiver for sensor gains
 _LIMIT = 2.0  # Maximum residual after the robust loss [sigma]
-_DIM = 3.0
-"""Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
+_DIM = 3.0  # Maximum distance from the median of readings that tell the noise [sigma]; most show no light
 _LIT = 8.0  # Minimum expectation of readings that determine the error of the curves [sigma]
 _OUTLIER = 3.0  # Residuals beyond it are of blocked or too bright readings [sigma]
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
@@ -303,8 +302,7 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
 
 
 MAX_RANGE = 0.3  # Maximum distance of exchanges that are used [m]; farther readings are mostly noise
-_BODIES = 2.0
-"""Maximum distance of an occluding robot from the line of sight between two others [robot radii]."""
+_BODIES = 2.0  # Maximum distance of an occluding robot from the line between two others [robot radii]
 _TRUTH_GAP_NS = 200_000_000
 
 
@@ -393,8 +391,7 @@ are sometimes dark, and yields worse results on other recordings: 10.6 instead o
 MIN_EXCHANGES = 100  # Minimum number of exchanges with ground truth
 BLOCKS = 3
 _STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)  # Candidate values of stray light
-_MISFIT = 3.0
-"""Maximum RMS residual of the initial platform; beyond it its curves are considered wrong [sigma]."""
+_MISFIT = 3.0  # Maximum RMS residual of the initial platform, whose curves are wrong beyond [sigma]
 _TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
 """Share of errors that must lie within the 99 % bound of the normal distribution; covariances are scaled."""
 _MAX_SCALE = 30.0

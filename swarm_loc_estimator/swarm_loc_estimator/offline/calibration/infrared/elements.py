@@ -223,8 +223,7 @@ _SHOWS_MOTION = 10.0  # Minimum of the brightest reading of pairs tested for mot
 _MAX_CHANGE = 0.3  # Maximum change of a stationary pair beyond noise: relative root sum of squares
 _MOTIONS, _MOVED = 3, 0.05
 """Number of motion directions (range, bearing, heading); false alarm probability of the F test for motion."""
-_MIN_STANDING = 0.2
-"""Minimum share of stationary pairs; fewer may pass the test by chance while all robots move."""
+_MIN_STANDING = 0.2  # Minimum share of stationary pairs; fewer may pass the test by chance
 _MIN_READINGS = 60  # Minimum number of differences for the noise of a sensor
 _MIN_FREE = 0.2  # Minimum share of a change that motion cannot explain, for its use in the noise estimate
 _TRIM, _TRIMMED = 3.0, 0.9733
