@@ -18,8 +18,7 @@ DIRECTIONS = range(8)
 
 _TICK_S = 1.024e-3
 _ON_TICKS, _OFF_TICKS, _TRIMS_PER_TICK = 20, 40, 32
-_UNCALIBRATED = 0xFFFF - 1000
-"""An unwritten EEPROM holds 0xFFFF; the firmware treats values near it as uncalibrated."""
+_UNCALIBRATED = 0xFFFF - 1000  # An unwritten EEPROM holds 0xFFFF; values near it are uncalibrated
 _UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000  # The firmware then uses these, per 1000 steps
 
 
@@ -80,8 +79,7 @@ EMIT_DELAY_NS = 5 * _MS  # From the command to emit until the call
 CALL_NS = (_HEADER + 1) * _BYTE_NS
 LEAD_NS = 32 * _MS  # From the beginning of the call to the first flash
 FLASH_NS, GAP_NS = 16 * _MS, 10 * _MS
-EXCHANGE_NS = LEAD_NS + ELEMENTS * (FLASH_NS + GAP_NS)
-"""From the beginning of the call until all robots listen again."""
+EXCHANGE_NS = LEAD_NS + ELEMENTS * (FLASH_NS + GAP_NS)  # From the call until all robots listen again
 PRINT_DELAY_NS = 10 * _MS  # From the end of the exchange until the matrix is printed
 
 
@@ -95,8 +93,7 @@ def flash_ns(emitter: int) -> int:
     return LEAD_NS + emitter * (FLASH_NS + GAP_NS) + FLASH_NS // 2
 
 
-MIDDLE_NS = (flash_ns(0) + flash_ns(ELEMENTS - 1)) // 2
-"""Middle of the measurements after the beginning of the call."""
+MIDDLE_NS = (flash_ns(0) + flash_ns(ELEMENTS - 1)) // 2  # Of the measurements, after the call began
 PRINTED_AFTER_NS = EXCHANGE_NS + PRINT_DELAY_NS - MIDDLE_NS
 """From the middle of the measurements until the matrix is printed."""
 EMITTED_AFTER_NS = EMIT_DELAY_NS + EXCHANGE_NS + PRINT_DELAY_NS

@@ -16,8 +16,7 @@ from swarm_loc_drivers.droplet.hardware import Gait
 from swarm_loc_estimator.common.arrays import FloatArray
 
 _NS = 1e9
-_ALL_OR_NONE = 1.0 / 3.0
-"""Variance in units of the motion if its true share is uniform in [0, 1] and the estimate is 1."""
+_ALL_OR_NONE = 1.0 / 3.0  # Mean square of 1 - s for a true share s that is uniform in [0, 1]
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ Rates = tuple[float, float]
 _TIMING_SLACK_S = 0.15
 """Further uncertainty of a stamp, beyond that known to the session: stamps are those of the computer."""
 _DELAY_NS = 500_000_000  # Longest delay of a command to the robot, and of a reading from it
-_MIN_PERIOD_NS = 4_000_000
-"""No robot answers faster: readings that arrive closer together were delayed in transit."""
+_MIN_PERIOD_NS = 4_000_000  # No robot answers faster: readings closer together were delayed in transit
 _ROUNDING_STEPS = 2
 
 

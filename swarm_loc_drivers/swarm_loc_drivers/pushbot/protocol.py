@@ -56,8 +56,7 @@ def tick_difference(before: int, after: int) -> int:
     return (after - before + TICK_SPAN // 2) % TICK_SPAN - TICK_SPAN // 2
 
 
-RESET = b"\nR\n"
-"""Reset the board: motors off, ticks and clock zero. The newline ends a previous line that was cut."""
+RESET = b"\nR\n"  # Motors off, ticks and clock zero. The newline ends a previous line that was cut
 NO_ECHO = b"!U0\n"
 LIST_SENSORS = b"??S\n"
 QUERY_FORMAT = b"?E\n"

@@ -73,8 +73,7 @@ _MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 
 after the update; w; s; the accumulated variances of the two tracks, and an unused number."""
 _DECORRELATION_ANGLE = 0.5  # Turn after which errors have a correlation of exp(-1/2) with those before [rad]
 _INITIAL_INFLATION = 1.5  # Factor on the variances of a measurement that initializes a robot
-_STATIONARY_SIGMA = 1e-4
-"""Robots are stationary while their tracks accumulate a smaller standard deviation [m, rad]."""
+_STATIONARY_SIGMA = 1e-4  # Robots are stationary while their tracks accumulate less [m, rad]
 _NEGLIGIBLE = 1e-8  # Share of the information of a measurement that is neglected
 
 

@@ -24,8 +24,7 @@ DEPENDS_ON = 9
 """Filter columns per measurement: three of the observer, three of the target, three of the observer's camera,
 of which those of a range are the biases of both radios."""
 _LINKS = 16  # Most recent links of a robot that are remembered
-_DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
-"""Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
+_DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)  # Added to the pose of a contradicted robot [m, m, rad]
 _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
 """Standard deviation of poses after all parameters are reset to their priors [m], [m], [rad]."""
 _ALONE: IntArray = np.zeros(0, dtype=np.int64)

@@ -144,8 +144,7 @@ def _symmetric(covariance: FloatArray) -> FloatArray:
 
 
 _CONCENTRATED = 8.0  # Concentration from which a von Mises heading is treated as Gaussian: 0.36 rad
-_ANY_DIRECTION = 3.0
-"""Standard deviation of c along the circle before its direction is known; wide for a linear model."""
+_ANY_DIRECTION = 3.0  # Sigma of c along the circle before its direction is known; wide for a linear model
 
 
 class Scale(NamedTuple):
@@ -279,8 +278,7 @@ def _tracks_from(
 
 _NEGLIGIBLE = 12.0  # Chains whose log weight lies this far below the largest one are dropped
 _MAX_TRACKS = 3000
-_MAX_ANCHORED_IMAGES = 6
-"""Chains without heading end when their last detection is older than this number of images."""
+_MAX_ANCHORED_IMAGES = 6  # Images after their last detection at which chains without heading end
 _LIKENESS = 0.5  # Relative standard deviation of distance and turn of another robot of the same kind
 _LEAST_TURN_SPREAD = 0.1
 _OUTSIDE = 0.5  # Factor on the detection probability outside the area of all detections so far

@@ -158,8 +158,7 @@ def goal_by_odometry(pose: FloatArray, odometry: FloatArray, goal: FloatArray, r
 _LATTICE, _CANDIDATES = 0.2, 260  # Distance of possible goals [m], and their maximum number
 _MIN_PATH = 0.3  # Minimum length of the path to a goal [m]
 _REACH_SHARE = 0.72  # Share of the laser's range within which walls are measured accurately
-_MIN_WALL = 0.6
-"""Length of the walls in sight of a place below which it is in the open; false echoes are shorter [m]."""
+_MIN_WALL = 0.6  # Length of walls in sight below which a place is in the open; false echoes are shorter [m]
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8
 """Distances within which earlier stops and goals of others make a goal less valuable [m], and how much."""
 

@@ -24,8 +24,7 @@ _MIN_DISTANCE = 0.05  # Minimum distance of a line from the stop with the beam [
 _ROUGHNESS = 0.004  # Standard deviation of walls from straight lines [m]
 _GATE_VARIANCES = 16.0  # Maximum squared residual of a matched beam, in variances
 _RANGE_SIGMAS = 2.5  # Lines nearer to the laser's range than this are not compared [sigma]
-_IMITATED = 5.0
-"""Information along lines over what errors of their normals imitate, below which it is no information."""
+_IMITATED = 5.0  # Information along lines over what errors of normals imitate, below which there is none
 
 OFF, UNUSABLE, FIT = 0, 1, 2  # Result for a beam: off the line; not comparable; on the line
 

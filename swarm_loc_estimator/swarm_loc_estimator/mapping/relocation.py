@@ -65,8 +65,8 @@ class Search:
     poses: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3)))  # (h, k, 3)
     fits: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) share of beams that fit
     known: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) of which the map tells
-    # (h,) number of lights that fit, less half a scan for each drive in which something held the robot
-    lit: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lit: FloatArray = field(default_factory=lambda: np.zeros(0))  # (h,) number of lights that fit
+    held: FloatArray = field(default_factory=lambda: np.zeros(0))  # (h,) number of drives that were held
     stops: list[ScanStop] = field(default_factory=list)  # (k,)
     since: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) motion since the last arrival
     left: FloatArray | None = None  # (3,) odometry then
@@ -112,12 +112,13 @@ class Search:
         if not len(self.poses) or self.fits.shape[1] < _PLACES:
             return -1
         total = self._totals()
-        best = int(total.argmax())
+        likely = total - _RULED_OUT * self.held  # a robot is rarely held, but a rival may have been
+        best = int(likely.argmax())
         nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
         rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
         known, fits = self.known[best].sum(), self.fits[best].sum()
         is_seen = self.known[best, -_PLACES:].mean() > _MIN_KNOWN and fits > _FITS * known
-        return best if is_seen and total[best] - rival > _RULED_OUT else -1
+        return best if is_seen and likely[best] - rival > _RULED_OUT else -1
 
     @property
     def is_contradicted(self) -> bool:
@@ -165,7 +166,7 @@ class Search:
             chosen.append(poses[0])
             poses = poses[_apart(poses[0], poses)]
         self.poses, self.fits, self.known = np.zeros((len(chosen), 0, 3)), *np.zeros((2, len(chosen), 0))
-        self.lit = np.zeros(len(chosen))
+        self.lit, self.held = np.zeros((2, len(chosen)))
         self._append(view, np.array(chosen).reshape(-1, 3), np.zeros((len(chosen), 2)))
 
     def _append(self, view: _View, predicted: FloatArray, way: FloatArray) -> None:
@@ -183,7 +184,7 @@ class Search:
             scores -= _HELD_COST if step else 0.0
             is_better = scores > best
             aligned[is_better], best[is_better], steps[is_better] = there[is_better], scores[is_better], step
-        self.lit -= _RULED_OUT * (steps > 0)
+        self.held += steps > 0
         poses = np.column_stack([view.places(aligned[:, :2]), aligned[:, 2]])
         fits, known = _compare(view.score, view.occupied, view.ends, view.hits, aligned, _NEAREST / view.cell)
         self.poses = np.concatenate([self.poses, poses[:, None]], axis=1)
@@ -204,7 +205,7 @@ class Search:
                 keep.append(one)
         self.found = keep.index(self.found) if self.found in keep else -1
         self.poses, self.fits = self.poses[keep], self.fits[keep]
-        self.known, self.lit = self.known[keep], self.lit[keep]
+        self.known, self.lit, self.held = self.known[keep], self.lit[keep], self.held[keep]
 
 
 class _View:

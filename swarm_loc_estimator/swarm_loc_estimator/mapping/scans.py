@@ -83,8 +83,7 @@ def set_beams(beams: Beams, stop: int, scan: Scan) -> None:
 
 
 BINS = 360
-UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
-"""Kinds of a direction: unknown; no reflection; reflection without a line; line."""
+UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3  # Kinds of a direction; POINT: reflection without a line
 
 _SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL = range(11)
 """Sums over the beams of a direction; y is the inverse distance."""

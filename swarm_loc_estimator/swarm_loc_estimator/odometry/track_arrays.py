@@ -48,8 +48,7 @@ COVER_NS = round(1e9 * _MEMORY_S)  # Time for which turns before a contradiction
 _PATIENCE_S, _NEW_PATIENCE_S = 3.0, 0.5  # The second one before the gyroscope has agreed
 _FIRST_STEPS, _MOST_STEPS = 8.0, 200.0  # Weight of the described noise in steps, and memory of the noise
 _MOST_NOISE = 100.0  # Largest measured noise of a step, in described ones
-_LEAST_TURN, _SIGMAS = 0.1, 3.0
-"""Least turn of the wheels for a verdict [rad], and the same in multiples of sigma."""
+_LEAST_TURN, _SIGMAS = 0.1, 3.0  # Least turn of the wheels for a verdict [rad], and in multiples of sigma
 _LEAST_APART, _APART_SIGMAS = 0.03, 3.0  # The same of the difference to be covered
 _LEAST_RATIO, _MOST_RATIO = 0.3, 3.0
 _SLACK, _SKID_SLACK, _REPEATED_SLACK = 0.1, 0.3, 0.05

@@ -12,8 +12,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 
-MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02
-"""A position is misleading beyond both limits: standard deviations, and [m]."""
+MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02  # A position is misleading beyond both: standard deviations, [m]
 
 
 class MetricsError(ValueError):

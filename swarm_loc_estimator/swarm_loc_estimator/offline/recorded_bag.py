@@ -185,8 +185,7 @@ class TruthReader:
         return Trajectory(stamp_ns, pose) if stamp_ns.size else None
 
 
-Progress = Callable[[float, str], None]
-"""Called with the completed share, 0 to 1, and the name of the present step."""
+Progress = Callable[[float, str], None]  # Called with the share done, 0 to 1, and the present step
 
 
 def unwatched(_share: float, _what: str) -> None:

@@ -149,11 +149,9 @@ MAX_DETECTIONS = 200_000
 _TICKS_AT_ONCE = 256
 _COLUMNS = ("stamp_ns", "pose", "covariance", "status", "heading_known", "is_local")
 _SIGHTINGS_PERIOD_NS = 500_000_000
-_MAX_SIGHTINGS = 500_000
-"""Maximum number of sightings stored for display; later ones of a long run are not stored."""
+_MAX_SIGHTINGS = 500_000  # Sightings stored for display; later ones of a long run are not stored
 
-_MAX_LOSSES = 100_000
-"""Maximum number of losses of robots that are stored; later ones of a long run are not stored."""
+_MAX_LOSSES = 100_000  # Losses of robots that are stored; later ones of a long run are not
 
 
 class ListedSchedule:

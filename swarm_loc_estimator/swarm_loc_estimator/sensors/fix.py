@@ -20,8 +20,7 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 NO_COVARIANCE = "fix_without_covariance"
 """Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
-_FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))
-"""Least covariance of a fix, whatever a message claims: 0.5 mm, 1 mrad."""
+_FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # Least covariance of a fix, whatever a message claims
 _GATE = float(MODELS[CARTESIAN].gate(0.9999))
 
 

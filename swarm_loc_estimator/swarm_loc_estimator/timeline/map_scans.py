@@ -58,8 +58,7 @@ _SHARED, _SHARED_TURN = 0.5, 0.1
 """Shares of the map's variance that remain in the position, and at the mean distance in the heading."""
 _CAUCHY = 6.0  # Square of the scale of the Cauchy loss, in variances
 _STEPS, _FINE_FROM = 12, 5  # Number of Gauss-Newton steps, and the one from which only near walls count
-_NEAR_M, _NEAR_SIGMAS = 0.05, 3.0
-"""Up to this distance, two cells and these standard deviations a beam fits a wall."""
+_NEAR_M, _NEAR_SIGMAS = 0.05, 3.0  # Up to this distance, two cells and these sigmas a beam fits a wall
 _IMITATED = 5.0  # Information over what errors of normals imitate, below which it is no information
 _MIN_INFORMATION = 4.0  # Information below which a direction is not determined [1/m^2]
 UNDETERMINED_SIGMA = 2.0

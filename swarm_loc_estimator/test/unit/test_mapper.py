@@ -231,6 +231,17 @@ def test_a_lost_robot_that_something_holds_has_looked_from_one_place_only(seed: 
     assert (is_aligned & (np.hypot(off[:, 0], off[:, 1]) < 0.03)).any()
 
 
+@pytest.mark.parametrize(
+    ("held", "other", "found"), [((0.0, 0.0), 0.6, 0), ((2.0, 0.0), 0.95, -1), ((0.0, 2.0), 0.6, 0)]
+)
+def test_a_place_is_not_ruled_out_because_something_held_the_robot_on_its_way(
+    held: tuple[float, float], other: float, found: int
+) -> None:
+    poses = np.array([[[0.0, 0.0, 0.0]] * 3, [[0.5, 0.0, 0.0]] * 3])
+    fits, known = np.array([[0.98] * 3, [other] * 3]), np.ones((2, 3))
+    assert Search(np.zeros(3), 2.0, poses, fits, known, np.zeros(2), np.array(held)).verdict() == found
+
+
 def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     mapper, robot = CooperativeMapper(), RoomRobot((*MIDDLE, 0.3), 0.0, np.random.default_rng(22))
     robot.has_niche = False
@@ -256,7 +267,8 @@ def test_a_lost_robot_follows_its_odometry_where_the_map_tells_nothing() -> None
     search = mapper._tracks[0].search
     assert search is not None
     search.poses = np.array([[compose([50.0, 0.0, 0.0], arrivals[0])]])
-    search.fits, search.known, search.lit = *np.zeros((2, 1, 1)), np.zeros(1)
+    search.fits, search.known = np.zeros((2, 1, 1))
+    search.lit, search.held = np.zeros((2, 1))
     feed(mapper, 0, [robot.drive(0.3)])
     arrivals.append(robot.pose.copy())
     feed(mapper, 0, [robot.turn(SCAN_TURN), robot.rest(1.2)])

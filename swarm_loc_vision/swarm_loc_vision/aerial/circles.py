@@ -163,8 +163,7 @@ RAYS = 64
 _WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
 _OFF, _NEAR = 0.08, 0.12
 """Largest distance of an edge of a circle, and of one that shows its errors, from the circle in radii."""
-_ALONG = 0.92
-"""Least cosine of the angle between the slope of brightness at an edge and the normal of the outline."""
+_ALONG = 0.92  # Least cosine of the angle between the slope of brightness at an edge and the normal there
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4  # Candidates are first tested on every fourth ray; this share must meet an edge

@@ -443,8 +443,7 @@ class FloorMarkers:
 NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
 _SETTLING, _LATER_EVERY = 10, 10
 """Markers are searched in this many first images, then in every n-th to detect motion of the camera."""
-_MOVED = 3.0
-"""Median displacement of markers that shows a motion of the camera, in standard deviations of a point."""
+_MOVED = 3.0  # Median displacement of markers that shows a motion of the camera, in sigmas of a point
 
 
 @dataclass(frozen=True)

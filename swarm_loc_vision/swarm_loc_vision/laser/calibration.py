@@ -129,8 +129,7 @@ def _take(drive: WallDrive, data: bytes, *, is_laser: bool) -> bool:
 
 
 MIN_SAMPLES = 50
-_MIN_SPREAD = 2.0
-"""Least ratio of the largest to the smallest depth; with less, f b and p_inf cannot be separated."""
+_MIN_SPREAD = 2.0  # Least ratio of the largest to the smallest depth; below, f b and p_inf look alike
 _MAX_RESIDUAL_PX = 1.0
 _START_PX = 0.1
 # The prior of the bias: checked by test_laser.py; figures: calibrate_laser.md.
@@ -139,8 +138,7 @@ _SIZE_PX = 0.3  # Prior standard deviation of a knot [px]
 _LEAST_SAMPLES = 4
 """Least number of samples between two knots. Near the wall rows change fast, samples are few and matter
 least."""
-_EDGE_SIGMAS = 2.0
-"""Rows so close to that of the farthest reading are left out: only those with low noise lie there."""
+_EDGE_SIGMAS = 2.0  # Rows so close to that of the farthest reading are left out: only low noise lies there
 _OUTLIER_SIGMAS = 10.0
 _ITERATIONS = 5
 _CAUCHY_SIGMAS = 2.4

@@ -54,8 +54,7 @@ class DetectorSettings(PoseSettings):
 
 
 _ROUGH_PX = 3.0  # Distance of the profiles across the sides of candidates [px]
-_MIN_EDGE = 2.0
-"""Minimum contrast of a candidate's sides over `min_contrast`, which is relative to the local mean."""
+_MIN_EDGE = 2.0  # Minimum contrast of a candidate's sides over `min_contrast`, relative to the local mean
 _MAX_CANDIDATES = 8192  # Maximum number of candidates per image; the smallest are dropped
 _BLOCK = 256  # Number of candidates decoded at once, to limit memory
 _SAME = 0.3  # Maximum distance of duplicate readings, relative to a marker's diagonal

@@ -33,8 +33,7 @@ from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarkers, Fore
 
 Markers = TypeVar("Markers", bound=MarkersInUse)
 
-_MAX_MISFIT_SHARE = 0.1
-"""Largest share of misfits since the last diagnostics; above it the calibration may be wrong."""
+_MAX_MISFIT_SHARE = 0.1  # Of misfits since the last diagnostics; above it the calibration may be wrong
 
 
 class MarkerNode(CameraNode[Markers]):

@@ -118,8 +118,7 @@ def sensor_values(body: EpuckBody, motors: Motors) -> NDArray[np.void]:
 
 _LARGEST = 4095
 _NOISE = 6.0
-_RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW
-"""A sensor reports the nearest of what these rays of its cone meet."""
+_RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW  # A sensor reports the nearest of what these rays meet
 
 
 def proximity_values(

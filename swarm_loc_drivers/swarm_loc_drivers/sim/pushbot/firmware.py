@@ -415,8 +415,7 @@ class Console:
 
 
 _BITS_PER_BYTE = 10
-LATE_SHARE = 0.03
-"""Share of received bytes that are parsed between a tick of the clock and the controllers' update."""
+LATE_SHARE = 0.03  # Share of received bytes parsed between a tick of the clock and the controllers' update
 _MAX_GAP_S = 0.02  # A wire that was blocked for longer does not catch up
 
 

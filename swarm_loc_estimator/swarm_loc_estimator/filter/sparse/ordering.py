@@ -404,9 +404,8 @@ def spread(places: FloatArray, count: int) -> IntArray:
     return np.array(picked, dtype=np.int64)
 
 
-_ORDERED_AGAIN = 3
-_GROWN = 1.2
-"""An order is replaced after this number of updates, or when its largest front has grown by this factor."""
+_ORDERED_AGAIN = 3  # Number of updates after which an order is replaced
+_GROWN = 1.2  # Growth of the largest front by which it is replaced before
 _NEAR_AGAIN = 9  # Number of updates after which near pairs are computed again
 
 

@@ -13,8 +13,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.batch.problem import BatchProblem
 
-_AGREES_M = 0.15
-"""Landmarks closer than this, or than a tenth of the distance between them, agree on an alignment."""
+_AGREES_M = 0.15  # Landmarks closer than this, or a tenth of the distance between them, agree
 
 
 @dataclass

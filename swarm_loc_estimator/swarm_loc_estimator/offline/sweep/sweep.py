@@ -446,8 +446,7 @@ def loaded(module: str, extra: str) -> Any:
         raise BackendError(f"{needed}: pip install 'swarm_loc_estimator[{extra}]' ({error}).") from error
 
 
-_AT_ONCE = 8
-"""Trials that are chosen at a time, whatever the number of workers, so that it does not change the table."""
+_AT_ONCE = 8  # Trials chosen at a time, whatever the number of workers: the table does not change
 
 
 class Best(NamedTuple):

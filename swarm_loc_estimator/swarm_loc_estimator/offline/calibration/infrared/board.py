@@ -44,8 +44,7 @@ _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5  # Index of the first knot from which curves must decrease
 # Weights and limits are checked by test_ir_boards.py; on recordings of 2016: `a084869b:bench/droplet/real`.
-_STEEPNESS, _BEND = 5.0, 0.8
-"""Weights of an increase beyond that knot, and of second differences of the log curves."""
+_STEEPNESS, _BEND = 5.0, 0.8  # Weights of increases beyond that knot, and of second differences
 _YAW_SIGMA = np.radians(4.0)
 _OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0  # Prior of the law, [m] and 1
 _PRIOR = 3.0

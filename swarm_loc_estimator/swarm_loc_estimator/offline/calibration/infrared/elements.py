@@ -215,8 +215,7 @@ def stabilized(values: FloatArray, noise: FloatArray | float, relative: FloatArr
 # Saturation and noise: checked by test_ir_boards.py.
 _SPAN, _WIDTHS = 0.3, (0.0, 0.005, 0.01, 0.02, 0.04)
 """Span below the highest reading, and widths of the windows at the top, relative to it."""
-_MIN_EMITTERS = 3
-"""Minimum number of emitters at the top: a single one may face the sensor at a constant distance."""
+_MIN_EMITTERS = 3  # Least number at the top: a single emitter may face the sensor at a constant distance
 _SAME = 0.2  # Maximum change of a reading within one geometry, relative to the brightest
 _CLEAR_OF_TOP = 0.9  # Maximum reading used for noise, relative to saturation
 _SHOWS_MOTION = 10.0  # Minimum of the brightest reading of pairs tested for motion [sigma of a change]
@@ -235,8 +234,7 @@ _TINY = 1e-300
 _FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3  # Initial noise: relative, and minimum [count]
 _LOWER, _FACTOR = 0.97, 1.5
 """Thresholds of a contradiction: saturation relative to the described one, and factor between noises."""
-_LEAST_RELATIVE = 0.05
-"""Minimum relative noise of a contradiction: small motions cause apparent noise of some percent."""
+_LEAST_RELATIVE = 0.05  # Least relative noise of a contradiction: small motions cause some percent of it
 
 
 @dataclass(frozen=True)
