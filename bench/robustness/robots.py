@@ -127,7 +127,7 @@ class Run:
         Raises:
             Exception: What ends the thread.
         """
-        fakes: Mapping[str, Any] = {"_open": lambda: self, "_stopping": self, "_tick": self}
+        fakes: Mapping[str, Any] = {"_open": self.open, "_stopping": self, "_tick": self}
         fakes = {name: one for name, one in fakes.items() if hasattr(self.driver, name)}
         with (
             patch.multiple(self.driver, **fakes),
@@ -155,6 +155,10 @@ class Run:
             times = end_us + np.arange(1 - count, 1) * 1000 // _EVENTS
             words = (times * 2_654_435_761 & 0x7FFF).astype(np.uint16)
             self.firmware.see(words, times)
+
+    def open(self) -> Run:
+        """The link."""
+        return self
 
     def read(self, timeout_s: float) -> bytes:
         """See `Link`."""

@@ -71,16 +71,22 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(
         ros.until(lambda: len(matrices) == 4)
         timer = ros.tester.create_timer(0.05, lambda: publisher.publish(Twist(linear=Vector3(x=-0.01))))
         ros.until(lambda: odometry[-1].pose.pose.position.x < -0.004)
+        relay = ros.tester.create_publisher(Twist, "droplet3/cmd_vel", 1)
+        relayed_timer = ros.tester.create_timer(0.05, lambda: relay.publish(Twist(linear=Vector3(x=-0.01))))
+        ros.until(lambda: relayed[-1].pose.pose.position.x < -0.004)
         ros.until(lambda: frames_of(transforms) == {"droplet1/base_link", "droplet3/base_link"})
         ros.until(lambda: diagnostics and values_of(diagnostics[-1].status[0]).get("exchanges") == "2")
         timer.cancel()
+        relayed_timer.cancel()
         assert program.end(signal.SIGINT) == 0, program.output
     first = np.array(robots.truth())
     assert (np.array(robots.truth()) == first).all()
-    moved = se2.between(TRIANGLE[0], first[0])
-    # what it went until it stood is published until then
-    ros.until(lambda: odometry[-1].pose.pose.position.x == pytest.approx(moved[0], abs=4e-3))
-    assert (first[1:] == TRIANGLE[1:]).all()
+    for heard, robot in ((odometry, 0), (relayed, 2)):
+        moved = se2.between(TRIANGLE[robot], first[robot])
+        # what it went until it stood is published until then
+        ros.until(lambda: heard[-1].pose.pose.position.x == pytest.approx(moved[0], abs=4e-3))  # noqa: B023
+    assert relayed[-1].pose.covariance[0] > 0.05 * 0.006**2  # it may not have heard
+    assert (first[1] == TRIANGLE[1]).all()
 
     platform = load_ir_platform("droplet")
     for near, far in zip(matrices[::2], matrices[1::2], strict=True):

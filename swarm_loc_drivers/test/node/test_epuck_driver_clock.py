@@ -2,6 +2,7 @@
 
 import math
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -11,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from epuck_body import GEOMETRY, DrivenBody
-from epuck_rig import Emulator, Robots
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import SECOND, T0_NS, Ros, overrides, stamp_ns
@@ -24,6 +24,9 @@ from swarm_loc_drivers.common import robot_driver
 from swarm_loc_drivers.epuck import wifi_session
 from swarm_loc_drivers.epuck.epuck_driver_node import EpuckDriverNode
 from swarm_loc_drivers.epuck.hardware import EPUCK2
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.link_host import FirmwareHost
 
 STEP_NS = SECOND // 50
 CALIBRATION = """
@@ -48,11 +51,11 @@ class World:
         age_ns: Of the readings that it sends.
     """
 
-    def __init__(self, ros: Ros, robots: Robots) -> None:
+    def __init__(self, ros: Ros, stack: ExitStack) -> None:
         self.now_ns = T0_NS
         self._ros = ros
         self.body = DrivenBody(lambda: self.now_ns, steps=(32700, -32700))
-        self.robots = robots
+        self.stack = stack
         self.heard = b""
         self.rounds = self.age_ns = 0
         self._clock = ros.tester.create_publisher(Clock, "/clock", 10)
@@ -100,13 +103,13 @@ class World:
 
 
 @pytest.fixture
-def world(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+def world(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     # real time does not count here
     monkeypatch.setattr(robot_driver, "STANDING_CLOCK_S", math.inf)
     monkeypatch.setattr(wifi_session, "_REPEAT_S", math.inf)
     monkeypatch.setattr(robot_driver, "MAX_STOP_S", 0.1)  # who could answer is gone when the node ends
     with ExitStack() as stack:
-        yield World(ros, Robots(tmp_path, stack, stack))
+        yield World(ros, stack)
 
 
 def node_on(address: object, **values: object) -> EpuckDriverNode:
@@ -117,8 +120,8 @@ def node_on(address: object, **values: object) -> EpuckDriverNode:
     return node
 
 
-def serve(world: World, over: str) -> tuple[Emulator, object]:
-    """The robot, and its address."""
+def serve(world: World, over: str) -> object:
+    """The robot's address."""
 
     def noting(firmware: Any) -> Any:
         receive, stream = firmware.receive, firmware.stream
@@ -136,10 +139,22 @@ def serve(world: World, over: str) -> tuple[Emulator, object]:
         firmware.receive, firmware.stream = heard, streamed
         return firmware
 
+    host, ended = world.stack.enter_context(FirmwareHost()), threading.Event()
+
+    def answer() -> None:
+        while not ended.is_set():
+            host.poll(0.002)
+
     if over == "wifi":
         world.age_ns = STEP_NS  # it streams what it has read a cycle before
-        return world.robots.wifi(body=world.body, wrap=noting), world.robots.tcp_address
-    return world.robots.serial(EPUCK2, body=world.body, wrap=noting), world.robots.serial_address
+        address: object = f"tcp://127.0.0.1:{host.serve_tcp(noting(WifiFirmware(world.body)))}"
+    else:
+        address = host.serve_pty(noting(SerialFirmware(world.body, EPUCK2)))
+    thread = threading.Thread(target=answer)
+    thread.start()
+    world.stack.callback(thread.join)
+    world.stack.callback(ended.set)
+    return address
 
 
 @pytest.mark.parametrize("over", ["serial", "wifi"])
@@ -151,7 +166,7 @@ def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros,
     its command, the stop in answer to what a cycle streams, so that the same one may still read it: 0.02 s
     less. Whole steps of the motors are counted.
     """
-    _, address = serve(world, over)
+    address = serve(world, over)
     world.connect(node_on(address))
     world.until(lambda: world.odometry)
     world.rest()
@@ -174,7 +189,7 @@ def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros,
 
 
 def test_time_that_jumps_back_stops_the_robot_and_goes_on(world: World, ros: Ros) -> None:
-    _, address = serve(world, "serial")
+    address = serve(world, "serial")
     world.connect(node_on(address))
     world.until(lambda: world.odometry)
     world.command(0.1)
@@ -197,7 +212,7 @@ def test_pictures_come_with_their_calibration(world: World, ros: Ros, tmp_path: 
     path.write_text(CALIBRATION, encoding="utf-8")
     rows, columns = np.mgrid[:960, :1280]
     frame = np.stack([rows // 8, columns // 8, 0 * rows], axis=-1).astype(np.uint8)
-    _, address = serve(world, "wifi")
+    address = serve(world, "wifi")
     world.connect(node_on(address, camera=True, camera_info_file=str(path)))
     world.body.frame = (frame, None)
     world.until(lambda: images and infos)

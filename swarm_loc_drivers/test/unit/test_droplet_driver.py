@@ -1,25 +1,19 @@
-"""Drivers of Droplets: console, infrared of exchanges, and calibration."""
+"""Droplets: what their consoles print, infrared of exchanges, and calibration."""
 
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from background import Background
-from droplet_rig import IDEAL, IDS, LINK, NOISE, QUIET, SECOND, TRIANGLE, world_of
+from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.scenarios.bags import write_droplet_bag
 from bench.scenarios.droplets_run import DropletRunSettings, simulate_droplets
-from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.droplet import protocol as console
-from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
-from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.hardware import (
     DIRECTIONS,
     ELEMENTS,
@@ -30,7 +24,6 @@ from swarm_loc_drivers.droplet.hardware import (
     gait,
     message_ns,
 )
-from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_drivers.droplet.protocol import (
     BROKEN,
     UNKNOWN,
@@ -46,17 +39,13 @@ from swarm_loc_drivers.droplet.protocol import (
     SendAborted,
     StepLength,
 )
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
-from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand, InfraredSettings
+from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand
 from swarm_loc_drivers.sim.droplet.world import (
     NEAR_POWER,
     STEP_NS,
     DropletErrors,
     DropletWorld,
-    SimulatedDroplet,
-    nominal_gait,
 )
-from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.cli import calibrate_ir
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -64,187 +53,6 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-
-PATIENCE_S = 60.0
-SPEED = nominal_gait(0).velocity[0]
-
-
-class Emulator:
-    """A world in a thread, twice as fast as real time, with the first robot on a pseudo-terminal."""
-
-    def __init__(self, world: DropletWorld, device: Path) -> None:
-        self.world = world
-        self._host = FirmwareHost()
-        robots = [DropletFirmware(SimulatedDroplet(world, robot)) for robot in range(len(world.ids))]
-        self._host.serve_pty(robots[0], device)
-        self._others = robots[1:]
-        self._background = Background(self._step)
-
-    def _step(self) -> None:
-        self.world.step()
-        for robot in self._others:
-            robot.stream()
-        self._host.poll(0.5 * STEP_NS / SECOND)
-
-    @property
-    def moves(self) -> bool:
-        """Whether any robot moves."""
-        return bool(self.world._twists.any())
-
-    def kill(self) -> None:
-        """Switch it off."""
-        self._background.end()
-        self._host.close()
-
-
-class Desk:
-    """A driver, what it reports, and the velocity that it is commanded again and again."""
-
-    def __init__(self, params: DropletParameters, clock: Callable[[], int]) -> None:
-        self.states: dict[str, list[OdometryState]] = {name: [] for name in (OWN, *params.relayed_ids)}
-        self.matrices: list[Brightness] = []
-        self.velocity: dict[str, tuple[float, float, float]] = {}
-        listeners = DropletListeners(
-            lambda name, state: self.states[name].append(state), lambda _, one: self.matrices.append(one)
-        )
-        self.driver = DropletDriver(params, listeners, clock)
-        self.driver.start()
-        self._ticker = Background(self._tick, 0.01)
-
-    def _tick(self) -> None:
-        for name, velocity in self.velocity.items():
-            self.driver.set_velocity(name, velocity)
-
-    def until(self, condition: Callable[[], object]) -> None:
-        """Wait until something is so."""
-        end_s = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < end_s, (self.driver.trouble, self.driver.counts)
-            time.sleep(0.005)
-
-    def stop(self) -> None:
-        """End."""
-        self._ticker.end()
-        self.driver.stop()
-
-
-class Lab:
-    """Makes emulators and drivers, and ends them."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self.device, self._stack = folder / "droplet", stack
-        self.world = world_of()
-
-    def emulator(self, world: DropletWorld | None = None) -> Emulator:
-        """The robots, always at the same port."""
-        self.world = world or self.world
-        emulator = Emulator(self.world, self.device)
-        self._stack.callback(emulator.kill)
-        return emulator
-
-    def desk(self, *partners: int, **relayed: int) -> Desk:
-        """A driver at work."""
-        params = DropletParameters(
-            address=str(self.device),
-            partners=tuple(f"{one:X}" for one in partners),
-            exchange_rate=0.0,
-            walk_noise=NOISE.walk_noise,
-            veer_noise=NOISE.veer_noise,
-            turn_noise=NOISE.turn_noise,
-            cmd_vel_timeout_s=1.0,
-            odom_rate=10.0,
-            relayed=tuple(f"{name}={one:X}" for name, one in relayed.items()),
-        )
-        desk = Desk(params, lambda: self.world.now_ns)
-        self._stack.callback(desk.stop)
-        return desk
-
-
-@pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
-    with ExitStack() as stack:
-        yield Lab(tmp_path, stack)
-
-
-def moved(world: DropletWorld, robot: int = 0) -> FloatArray:
-    """Where a robot is now, as seen from where it began."""
-    return se2.between(TRIANGLE[robot], world.poses[robot])
-
-
-def test_it_walks_as_told_and_measures_on_request(lab: Lab) -> None:
-    emulator = lab.emulator()
-    desk = lab.desk(*IDS[1:])
-    desk.until(lambda: desk.states[OWN])
-    desk.velocity[OWN] = (0.01, 0.0, 0.0)
-    desk.until(lambda: desk.states[OWN][-1].pose[0] > 0.012)
-    desk.velocity[OWN] = (0.0, 0.0, 0.0)
-    desk.until(lambda: not desk.states[OWN][-1].twist.any())
-    desk.until(lambda: not emulator.moves)
-    pose = desk.states[OWN][-1].pose
-    assert moved(lab.world) == pytest.approx(pose, abs=4e-3)  # a busy machine reads echoes late
-    desk.driver.request_exchanges()
-    desk.until(lambda: len(desk.matrices) == 4)
-    assert {one.transmitter for one in desk.matrices} == set(IDS[1:])
-    stamps = np.array([state.stamp_ns for state in desk.states[OWN]])
-    assert (np.diff(stamps) > 0).all()
-    assert desk.driver.trouble == ""
-
-
-def test_a_robot_without_a_cable_is_driven_through_the_one_that_has_it(lab: Lab) -> None:
-    errors = replace(IDEAL, infrared=replace(LINK, loss=0.0))
-    lab.emulator(world_of(errors=errors))
-    desk = lab.desk(other=IDS[1])
-    desk.until(lambda: desk.states["other"])
-    desk.velocity["other"] = (-0.01, 0.0, 0.0)
-    desk.until(lambda: desk.states["other"][-1].pose[0] < -0.008)
-    desk.stop()
-    last = desk.states["other"][-1]
-    assert moved(lab.world, 1)[0] == pytest.approx(last.pose[0], abs=4e-3)
-    assert last.covariance[0, 0] > 0.05 * 0.006**2  # it may not have heard
-    assert not moved(lab.world).any()
-
-
-@pytest.mark.parametrize("how", ["stop", "silence"])
-def test_the_robot_stands_at_the_end_and_when_velocities_stop_coming(lab: Lab, how: str) -> None:
-    emulator = lab.emulator()
-    desk = lab.desk()
-    desk.until(lambda: desk.states[OWN])
-    desk.velocity[OWN] = (0.01, 0.0, 0.0)
-    desk.until(lambda: emulator.moves)
-    if how == "stop":
-        desk.driver.stop()
-        assert not emulator.moves
-    else:
-        desk.velocity.clear()
-        desk.until(lambda: desk.driver.counts["stale_cmd_vel"])
-        desk.until(lambda: not emulator.moves)
-
-
-def test_a_robot_whose_cable_was_pulled_is_found_again(lab: Lab) -> None:
-    emulator = lab.emulator()
-    desk = lab.desk()
-    desk.velocity[OWN] = (0.01, 0.0, 0.0)
-    desk.until(lambda: emulator.moves and desk.states[OWN])
-    emulator.kill()
-    desk.until(lambda: desk.driver.trouble)
-    before = desk.states[OWN][-1]
-    again = lab.emulator()  # the same world: the robot has gone on meanwhile
-    desk.until(lambda: not desk.driver.trouble)
-    desk.until(lambda: again.moves and desk.states[OWN][-1].covariance[0, 0] > before.covariance[0, 0])
-    assert desk.driver.counts["connections"] == 2
-    assert desk.driver.counts["link_failures"] >= 1
-    desk.stop()
-
-
-def test_a_port_that_is_not_there_is_named_and_waited_for(lab: Lab) -> None:
-    desk = lab.desk()
-    desk.until(lambda: desk.driver.counts["link_failures"] >= 2)
-    assert str(lab.device) in desk.driver.trouble
-    lab.emulator()
-    desk.until(lambda: desk.states[OWN])
-    assert desk.driver.trouble == ""
-    desk.stop()
-
 
 ROWS = tuple(tuple(range(10 * emitter, 10 * emitter + 6)) for emitter in range(6))
 SIGNED = ((-29, 13, -44, -31, 31, 44), *ROWS[1:])
@@ -531,16 +339,6 @@ def test_messages_reach_so_far() -> None:
     assert [len(heard) for heard in world.infrared.heard] == [0, 1, 0]
 
 
-def test_messages_are_for_one_or_for_all() -> None:
-    world = world_of()
-    world.infrared.send(0, "get_id", int(world.ids[2]), world.poses)
-    run(world, message_ns(6))
-    assert [len(heard) for heard in world.infrared.heard] == [0, 0, 1]
-    (heard,) = world.infrared.heard[2]
-    assert isinstance(heard, InfraredCommand)
-    assert heard.line == "get_id"
-
-
 def test_as_many_get_lost_as_described() -> None:
     share, count = 0.2, 500
     world = world_of(errors=with_link(loss=share))
@@ -560,16 +358,6 @@ def test_who_speaks_at_the_same_time_is_not_understood() -> None:
     run(world, SECOND)
     assert not any(world.infrared.heard)
     assert world.infrared.counts["collided"] == 4
-
-
-def test_who_measures_hears_nothing_else() -> None:
-    far = np.vstack([TRIANGLE[:2], [0.35, 0.02, 0.0]])  # hears the second, and not the first
-    world = world_of(far)
-    world.infrared.emit(0, FULL_POWER, world.poses)
-    run(world, EXCHANGE_NS // 2)
-    world.infrared.send(2, "get_id", 0, world.poses)
-    run(world, EXCHANGE_NS)
-    assert [type(one) for one in world.infrared.heard[1]] == [ExchangeReadings]
 
 
 def test_who_measured_when_a_message_began_does_not_understand_it() -> None:
@@ -599,13 +387,6 @@ def test_light_of_two_at_once_adds_up() -> None:
     (both,) = (one.readings for one in world.infrared.heard[1] if isinstance(one, ExchangeReadings))
     assert (both >= alone).all()
     assert both.sum() > 1.2 * alone.sum()
-
-
-def test_the_same_seed_gives_the_same_readings() -> None:
-    errors = replace(IDEAL, gain_sigma=0.1, infrared=InfraredSettings(0.3, 0.05, 6.0, 0.1))
-    first, again, other = (exchange(world_of(errors=errors, seed=seed, noise=1.0)) for seed in (4, 4, 5))
-    assert all((first[robot] == again[robot]).all() for robot in first)
-    assert any((first[robot] != other.get(robot)).any() for robot in first)
 
 
 SETTINGS = DropletRunSettings(seed=1, duration_s=40.0, robots=8, start_known=True, boards=1)

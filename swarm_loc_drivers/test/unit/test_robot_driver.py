@@ -1,26 +1,29 @@
-"""Drivers of robots: what all share, and that of the e-puck."""
+"""What all drivers of robots share: links, sessions that fail, defects, and robots that stand at the end."""
 
-import math
 import os
 import pty
 import socket
 import termios
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from epuck_body import GEOMETRY
-from epuck_rig import PATIENCE_S, SQUARE, Mute, Robots, params_of
+from epuck_rig import Mute
 
+from bench.robustness.robots import PROTOCOLS, Run
 from swarm_loc_drivers.common.link import LinkError, SerialLink
-from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver, SessionError
-from swarm_loc_drivers.epuck.hardware import EPUCK1
+from swarm_loc_drivers.common.odometry import OdometryState
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver, SessionError, Velocity
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.sim.link_host import FirmwareHost
-from swarm_loc_estimator.common import se2
+
+AHEAD = (0.02, 0.0, 0.0)
+EACH = pytest.mark.parametrize("protocol", PROTOCOLS)
+CUT = "the link is cut"
+Story = Iterator[Callable[[], bool]]
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])
@@ -159,106 +162,121 @@ def test_a_driver_without_time_ends_at_once() -> None:
     assert not driver.may_run
 
 
-@pytest.fixture
-def robots(tmp_path: Path) -> Iterator[Robots]:
-    with ExitStack() as emulators, ExitStack() as benches:  # drivers end while their robots answer
-        yield Robots(tmp_path, emulators, benches)
+class Played(Run):
+    """A driver and what happens to it: a generator yields what it waits for; at its end the driver stops."""
+
+    def __init__(self, protocol: str, story: Callable[["Played"], Story]) -> None:
+        self.states: list[OdometryState] = []
+        self.velocity: Velocity | None = None
+        self.is_cut = False
+        super().__init__(protocol, self._watch)
+        self._story = story(self)
+        self._condition = next(self._story)
+
+    def _watch(self) -> None:
+        assert self.now_s < 160.0, (self.driver.trouble, self.driver.counts)
+        if self.velocity is not None:
+            self.drive(self.velocity)
+        if self._condition():
+            self._condition = next(self._story, self.stop)
+
+    def moves(self) -> bool:
+        """Whether the robot moves."""
+        return any(self.body.rates)
+
+    def note(self, *received: Any) -> None:
+        """Keep a state of odometry."""
+        self.states.append(received[-1])
+
+    def open(self) -> Run:
+        """The link, unless it is cut."""
+        if self.is_cut:
+            raise LinkError(CUT)
+        return self
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link`."""
+        self.open()
+        return super().read(timeout_s)
 
 
-@pytest.mark.parametrize("over", ["serial", "wifi"])
-def test_the_robot_stands_when_the_driver_has_ended(robots: Robots, over: str) -> None:
-    emulator = robots.serial() if over == "serial" else robots.wifi()
-    address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(params_of(address))
-    bench.velocity = (0.06, 0.5)
-    bench.until(lambda: any(emulator.body.rates))
-    bench.driver.stop()
-    assert emulator.body.rates == (0.0, 0.0)
+@EACH
+def test_the_robot_stands_when_velocities_stop_coming_and_at_the_end(protocol: str) -> None:
+    def story(run: Played) -> Story:
+        run.velocity = AHEAD
+        yield run.moves
+        run.velocity = None
+        yield lambda: not run.moves()
+        run.velocity = AHEAD
+        yield run.moves
+
+    run = Played(protocol, story)
+    run.go()
+    assert not run.moves()
+    assert not run.driver.may_run
+    assert run.driver.counts["stale_cmd_vel"] == 1
 
 
-@pytest.mark.parametrize("over", ["serial", "wifi"])
-def test_the_robot_stands_when_velocities_stop_coming(robots: Robots, over: str) -> None:
-    emulator = robots.serial(EPUCK1) if over == "serial" else robots.wifi()
-    address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(params_of(address, "epuck1" if over == "serial" else "epuck2"))
-    bench.velocity = (0.06, 0.0)
-    bench.until(lambda: any(emulator.body.rates))
-    bench.fall_silent()
-    bench.until(lambda: not any(emulator.body.rates))
-    assert bench.driver.counts["stale_cmd_vel"] >= 1  # more where the machine paused before, too
+def cut_and_mended(run: Played) -> Story:
+    """A link that is cut for a second while the robot drives."""
+    run.velocity = AHEAD
+    yield lambda: run.moves() and len(run.states) > 2
+    run.is_cut = True
+    yield lambda: run.driver.trouble == CUT
+    mended_s = run.now_s + 1.0
+    yield lambda: run.now_s > mended_s
+    run.is_cut = False
+    yield lambda: not run.driver.trouble
+    count = len(run.states)
+    yield lambda: len(run.states) > count + 5
 
 
-@pytest.mark.parametrize("over", ["serial", "wifi"])
-def test_a_robot_switched_off_and_on_is_found_again(robots: Robots, over: str) -> None:
-    start = robots.serial if over == "serial" else robots.wifi
-    emulator = start()
-    address = robots.serial_address if over == "serial" else robots.tcp_address
-    # the link fails when it is broken here, and not while an emulated robot waits for a processor
-    bench = robots.bench(replace(params_of(address), reply_timeout_s=10.0))
-    bench.drive(SQUARE[:1])
-    emulator.kill()
-    bench.until(lambda: bench.driver.trouble)
-    before = bench.states[-1]
-
-    again = start()  # its counters and its place in the world begin at zero
-    bench.until(lambda: not bench.driver.trouble)
-    bench.until(lambda: bench.states[-1].stamp_ns > before.stamp_ns)
-    found = bench.states[-1].pose
-    origin = again.body.pose
-    bench.drive(SQUARE[1:3])
-    driven, true = se2.between(found, bench.states[-1].pose), se2.between(origin, again.body.pose)
-    assert driven == pytest.approx(true, abs=5e-3)
-    assert bench.driver.counts["connections"] == 2
-    assert bench.driver.counts["link_failures"] >= 1
+@EACH
+def test_a_robot_whose_link_was_cut_is_found_again(protocol: str) -> None:
+    run = Played(protocol, cut_and_mended)
+    run.go()
+    assert run.driver.counts["connections"] == 2
+    assert run.driver.counts["link_failures"] >= 1
+    assert (np.diff([one.stamp_ns for one in run.states]) > 0).all()
 
 
-@pytest.mark.parametrize("over", ["serial", "wifi"])
-def test_a_cut_link_costs_no_odometry_of_a_robot_that_runs_on(robots: Robots, over: str) -> None:
-    start = robots.serial if over == "serial" else robots.wifi
-    emulator = start()
-    address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(params_of(address))
-    bench.velocity = (0.06, 0.4)
-    bench.until(lambda: any(emulator.body.rates) and len(bench.states) > 10)
-    emulator.kill()
-    bench.until(lambda: bench.driver.trouble)
-    start(body=emulator.body)
-    bench.until(lambda: not bench.driver.trouble)
-    bench.drive(SQUARE[:1])
-    error = se2.between(emulator.body.pose, bench.states[-1].pose)
-    assert math.hypot(error[0], error[1]) <= 5e-3
-    assert abs(error[2]) <= 2.1 * GEOMETRY.metres_per_step / GEOMETRY.wheel_separation
-    assert not bench.driver.counts["counter_restarts"]
+@pytest.mark.parametrize("protocol", [name for name in PROTOCOLS if name.startswith("epuck")])
+def test_a_cut_link_costs_no_odometry_of_a_robot_that_runs_on(protocol: str) -> None:
+    run = Played(protocol, cut_and_mended)
+    begin = run.body.wheel_steps()
+    run.go()
+    steps = np.subtract(run.body.wheel_steps(), begin).mean()
+    way = steps * EpuckParameters("/dev/x").geometry.metres_per_step
+    assert run.states[-1].pose[:2] == pytest.approx([way, 0.0], abs=2e-3)
+    assert not run.driver.counts["counter_restarts"]
 
 
-def test_a_port_that_is_not_there_is_named_and_waited_for(robots: Robots) -> None:
-    bench = robots.bench(params_of(robots.serial_address, "epuck1"))
-    bench.until(lambda: bench.driver.counts["link_failures"] >= 2)
-    assert robots.serial_address in bench.driver.trouble
-    robots.serial(EPUCK1)
-    bench.until(lambda: bench.states)
-    assert bench.driver.trouble == ""
+def test_a_droplet_behind_a_cut_cable_may_have_gone_on_or_not() -> None:
+    run = Played("droplet", cut_and_mended)
+    run.go()
+    ways = np.diff([one.pose[0] for one in run.states])
+    variances = np.diff([one.covariance[0, 0] for one in run.states])
+    assert ways.max() > 2e-3
+    assert variances[ways.argmax()] > ways.max() ** 2 / 4.0
 
 
-def test_a_port_where_nobody_speaks_the_language_is_told(robots: Robots) -> None:
-    robots.serial(EPUCK1, wrap=lambda _: Mute())
-    quick = replace(params_of(robots.serial_address, "epuck1"), reply_timeout_s=0.02)
-    bench = robots.bench(quick)
-    bench.until(lambda: "does not answer" in bench.driver.trouble)
+@EACH
+def test_stopping_while_the_link_is_down_still_stops_the_robot(protocol: str) -> None:
+    def story(run: Played) -> Story:
+        run.velocity = AHEAD
+        yield run.moves
+        run.is_cut = True
+        yield lambda: run.driver.trouble == CUT
+        run.stop()
+        mended_s = run.now_s + 1.0
+        yield lambda: run.now_s > mended_s
+        run.is_cut = False
+        yield lambda: False
 
-
-def test_stopping_while_the_link_is_down_still_stops_the_robot(robots: Robots) -> None:
-    emulator = robots.wifi()
-    bench = robots.bench(params_of(robots.tcp_address))
-    bench.velocity = (0.06, 0.0)
-    bench.until(lambda: any(emulator.body.rates))
-    emulator.kill()
-    bench.until(lambda: bench.driver.trouble)
-    ending = threading.Thread(target=bench.driver.stop)
-    ending.start()
-    robots.wifi(body=emulator.body)
-    ending.join(PATIENCE_S)
-    assert emulator.body.rates == (0.0, 0.0)
+    run = Played(protocol, story)
+    run.go()
+    assert not run.moves()
+    assert not run.driver.may_run
 
 
 def test_a_serial_port_is_used_while_a_driver_has_it_open(tmp_path: Path) -> None:
