@@ -14,8 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, Vector3
 from node_world import Ros, overrides
 
-from bench.shared.parameter_table import markdown_table
-from swarm_loc_drivers.dotbot.dotbot_node import DotbotNode, DotbotParameters, pose_of
+from swarm_loc_drivers.dotbot.dotbot_node import DotbotNode, pose_of
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
@@ -182,8 +181,3 @@ def test_a_wrong_parameter_is_one_sentence(
     assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
     with pytest.raises(ParameterError, match=sentence):
         DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), **parameters))
-
-
-def test_the_page_has_all_parameters() -> None:
-    page = Path(__file__).parents[2] / "doc" / "dotbot_node.md"
-    assert markdown_table(DotbotParameters) in page.read_text(encoding="utf-8")

@@ -113,20 +113,3 @@ def test_nobody_is_asked_while_the_link_is_down(ros: Ros, tmp_path: Path) -> Non
     assert not response.success
     assert address in response.message
     assert ros.tester.count_subscribers("table/droplet3/cmd_vel") == 1
-
-
-@pytest.mark.parametrize(
-    ("parameters", "sentence"),
-    [
-        ({}, "parameter address is not set"),
-        ({"address": "/dev/nothing", "turns": 2, "turn": 2}, "parameter turn = 2 must be below turns = 2."),
-    ],
-)
-def test_a_wrong_parameter_ends_the_node_with_one_sentence(
-    tmp_path: Path, parameters: dict[str, object], sentence: str
-) -> None:
-    with Program("droplet_driver_node", tmp_path / "log", parameters, package="swarm_loc_drivers") as program:
-        assert program.end() == 1
-        (line,) = program.output.splitlines()
-    assert line.startswith("droplet_driver_node: ")
-    assert sentence in line

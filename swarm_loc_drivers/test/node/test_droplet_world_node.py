@@ -93,20 +93,3 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
         error[2] = se2.wrap_angle(error[2])
         assert np.abs(error / (0.003, 0.003, 0.02)).max() < 6.0
         assert fix.header.frame_id == "map"
-
-
-@pytest.mark.parametrize(
-    ("parameters", "sentence"),
-    [
-        ({"world": "d7"}, "parameter world = 'd7' must be one of d0, d1."),
-        ({"fixed": '["droplet9"]'}, "parameter fixed has 'droplet9', who is not in the swarm description."),
-        ({"link_folder": "/nowhere"}, "parameter link_folder = /nowhere cannot be used for droplet1"),
-    ],
-)
-def test_a_parameter_that_cannot_be_used_ends_it_with_one_sentence(
-    swarm_file: Path, tmp_path: Path, parameters: dict[str, object], sentence: str
-) -> None:
-    all_parameters = {"swarm_file": swarm_file, "link_folder": tmp_path, **parameters}
-    program = Program("droplet_world_node", tmp_path / "log", all_parameters, package="swarm_loc_drivers")
-    assert program.process.wait(60.0) == 1
-    assert sentence in program.output

@@ -269,38 +269,3 @@ def test_a_robot_that_dies_is_told_and_found_again(ros: Ros, robot: Start, drive
     controller.drive(SQUARE[:1])
     driven = se2.between(end, pose_of(controller.odometry[-1]))
     assert driven == pytest.approx(again.truth()["pose"], abs=5e-3)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "sentence"),
-    [
-        (
-            {"address": "/dev/nothing", "reading_rate": 0.01},
-            "parameter reading_rate = 0.01 must lie in [0.1, 200] 1/s.",
-        ),
-        ({"address": "udp://robot"}, "parameter address = 'udp://robot' must be the path of a serial port"),
-        ({"address": "tcp://robot:99999"}, "parameter address = 'tcp://robot:99999' must be"),
-        (
-            {"address": "/dev/nothing", "model": "epuck3"},
-            "parameter model = 'epuck3' must be one of epuck1, epuck2.",
-        ),
-        ({"address": "tcp://robot", "model": "epuck1"}, "does not go with address = 'tcp://robot:1000'"),
-        ({"address": "/dev/nothing", "camera": "true"}, "parameter camera_info_file is not set"),
-        (
-            {"address": "/dev/nothing", "camera": "true", "image_width": 60, "image_height": 60},
-            "make images of 7200 bytes, but an epuck2 can send at most 4128.",
-        ),
-        (
-            {"address": "/dev/nothing", "camera": "true", "camera_info_file": "/nowhere.yaml"},
-            "parameter camera_info_file: /nowhere.yaml cannot be read",
-        ),
-    ],
-)
-def test_a_wrong_parameter_ends_the_node_with_one_sentence(
-    tmp_path: Path, parameters: dict[str, object], sentence: str
-) -> None:
-    with Program("epuck_driver_node", tmp_path / "log", parameters, package="swarm_loc_drivers") as program:
-        assert program.end() == 1
-        (line,) = program.output.splitlines()
-    assert line.startswith("epuck_driver_node: ")
-    assert sentence in line

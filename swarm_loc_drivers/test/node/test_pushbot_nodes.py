@@ -17,7 +17,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
-from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.pushbot.driver import NO_STOP
 from swarm_loc_drivers.pushbot.pushbot_driver_node import PushbotDriverNode
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
@@ -28,7 +27,6 @@ from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
-from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters
 from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser, save_laser
 
 SEED = 3
@@ -241,11 +239,6 @@ def test_a_laser_that_is_never_seen_is_named(ros: Ros, tmp_path: Path, swarm_fil
         assert all(math.isnan(one.distance) and one.covariance[0] == -1.0 for one in hall.laser)
 
 
-def test_the_page_of_the_calibration_has_its_parameters() -> None:
-    page = Path(__file__).parents[3] / "swarm_loc_vision" / "doc" / "calibrate_laser.md"
-    assert markdown_table(CalibrateLaserParameters) in page.read_text(encoding="utf-8")
-
-
 @pytest.mark.timeout(300)  # a minute of the simulation, however slow the machine
 def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path) -> None:
     """The whole graph of `simulate`: serial ports, lasers, trackers, mapper, estimator, and who drives."""
@@ -352,52 +345,3 @@ def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, sw
     depths = np.linspace(0.12, 2.5, 100)
     read = [found.focal_base / (truth.row(depth) - found.row_at_infinity) for depth in depths]
     assert 100.0 * np.sqrt(np.mean((read - depths) ** 2)) < 3.0
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "parameters", "sentence"),
-    [
-        ("pushbot_driver_node", "swarm_loc_drivers", {}, "parameter address is not set"),
-        (
-            "pushbot_driver_node",
-            "swarm_loc_drivers",
-            {"address": "udp://x"},
-            "must be the path of a serial port",
-        ),
-        (
-            "pushbot_driver_node",
-            "swarm_loc_drivers",
-            {"address": "/dev/x", "timestamps": "64bit"},
-            "must be one of",
-        ),
-        (
-            "pushbot_driver_node",
-            "swarm_loc_drivers",
-            {"address": "/dev/x", "laser_frequency": 3.0},
-            "laser_frequency = 3.0 must be 0, or at least 10 Hz",
-        ),
-        ("pushbot_world_node", "swarm_loc_drivers", {"swarm_file": "missing.yaml"}, "missing.yaml"),
-        ("event_tracker_node", "swarm_loc_vision", {"calibration": "missing.yaml"}, "missing.yaml"),
-        ("event_tracker_node", "swarm_loc_vision", {"laser_frequency": 0.0}, "leave nothing to track"),
-        (
-            "event_tracker_node",
-            "swarm_loc_vision",
-            {"light_frequencies": "['abc']"},
-            "'abc' must lie in [10, 5000]",
-        ),
-        ("calibrate_laser", "swarm_loc_vision", {}, "parameter output is not set"),
-        (
-            "calibrate_laser",
-            "swarm_loc_vision",
-            {"output": "x.yaml", "stop_distance": 2.0},
-            "stop_distance = 2.0 must be less than half",
-        ),
-    ],
-)
-def test_what_cannot_be_used_ends_a_node_with_one_sentence(
-    tmp_path: Path, name: str, package: str, parameters: dict[str, object], sentence: str
-) -> None:
-    with Program(name, tmp_path / "log", parameters, package=package) as program:
-        assert program.end() == 1
-        assert sentence in program.output
-        assert "Traceback" not in program.output

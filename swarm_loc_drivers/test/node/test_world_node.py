@@ -115,14 +115,3 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
     model = CameraModel(**SIZE)
     np.testing.assert_allclose(infos[-1].k, model.camera.matrix.reshape(9))
     assert len({stamp_ns(one) for one in infos} & set(stamps)) > 0.9 * len(stamps)
-
-
-def test_a_parameter_that_cannot_be_used_ends_it_with_one_sentence(swarm_file: Path, tmp_path: Path) -> None:
-    program = Program(
-        "epuck_world_node",
-        tmp_path / "log",
-        {"swarm_file": swarm_file, "model": "epuck1"},
-        package="swarm_loc_drivers",
-    )
-    assert program.process.wait(60.0) == 1
-    assert "parameter model = 'epuck1' needs the parameter link_folder" in program.output

@@ -18,10 +18,10 @@ from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibrati
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters
 from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, make_world
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorldParameters, make_pushbot_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.room.world import RoomWorldParameters
 from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
@@ -53,6 +53,7 @@ projection_matrix: {rows: 3, cols: 4, data: [44, 0, 20, 0, 0, 44, 15, 0, 0, 0, 1
         ("pushbot_driver_node.md", PushbotParameters),
         ("pushbot_world_node.md", PushbotWorldParameters),
         ("exploration_node.md", ExplorationParameters),
+        ("room_world_node.md", RoomWorldParameters),
     ],
 )
 def test_the_page_says_what_the_table_says(page: str, parameters: type) -> None:
@@ -76,7 +77,17 @@ def test_addresses(text: str, address: Address, shown: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["rfcomm0", "tcp://", "tcp://:1000", "tcp://a:0", "tcp://a:x", "http://a", "tcp://a/b", "tcp://[a"],
+    [
+        "rfcomm0",
+        "tcp://",
+        "tcp://:1000",
+        "tcp://a:0",
+        "tcp://a:99999",
+        "tcp://a:x",
+        "http://a",
+        "tcp://a/b",
+        "tcp://[a",
+    ],
 )
 def test_what_is_no_address(text: str) -> None:
     with pytest.raises(ParameterError, match="must be the path of a serial port"):
@@ -122,8 +133,15 @@ def test_over_wifi_pictures_have_the_size_that_the_robot_sends(path: Path) -> No
     parameters = EpuckParameters(address="tcp://robot", camera=True, camera_info_file=str(path))
     assert parameters.images is not None
     assert (parameters.images.width, parameters.images.height) == (160, 120)
-    with pytest.raises(ParameterError, match="40 x 30 px, but the camera's have 160 x 120 px"):
-        camera_calibration(parameters, parameters.images)
+    for file, words in (
+        (str(path), "40 x 30 px, but the camera's have 160 x 120 px"),
+        ("", "parameter camera_info_file is not set"),
+        ("/nowhere.yaml", "parameter camera_info_file: /nowhere.yaml cannot be read"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            camera_calibration(replace(parameters, camera_info_file=file), parameters.images)
+    with pytest.raises(ParameterError, match="does not go with address = 'tcp://robot:1000'"):
+        replace(parameters, model="epuck1")
 
 
 def test_over_a_serial_port_pictures_fit_the_robots_buffer(path: Path) -> None:
@@ -222,12 +240,6 @@ def test_a_light_that_hardly_blinks_is_refused(name: str) -> None:
         replace(PushbotParameters(address="/dev/x"), **slow)
 
 
-def test_a_robot_within_a_wall_is_named(swarm_file: Path) -> None:
-    swarm_file.write_text(SWARM.replace("x: 1.5", "x: 0.01"))
-    with pytest.raises(ParameterError, match="robot 1 of the swarm begins within a wall"):
-        make_pushbot_world(PushbotWorldParameters(swarm_file=str(swarm_file)))
-
-
 def test_robots_run_into_walls_and_not_through(swarm_file: Path) -> None:
     _, world = make_pushbot_world(PushbotWorldParameters(swarm_file=str(swarm_file)))
     world.drivetrain.duties[:] = 0.8
@@ -282,11 +294,6 @@ def test_a_swarm_that_is_not_one_of_pushbots_is_named(swarm_file: Path) -> None:
         simulated_swarm(SimulationOptions(str(swarm_file)))
 
 
-def test_a_hall_that_is_not_there_is_named(swarm_file: Path) -> None:
-    with pytest.raises(FloorPlanError, match="no floor plan 'attic': it must be one of corridor, office"):
-        simulated_swarm(SimulationOptions(str(swarm_file), plan="attic"))
-
-
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])
 
 
@@ -326,11 +333,6 @@ def test_a_robot_without_a_start_is_named(parameters: EpuckWorldParameters) -> N
     save_swarm(describe(EightSettings(robots=2, start_known=False), START), Path(parameters.swarm_file))
     with pytest.raises(ParameterError, match=r"parameter swarm_file = .* robot 'epuck1' has no start pose"):
         make_world(parameters)
-
-
-def test_the_cameras_parameters_are_among_the_worlds() -> None:
-    names = {spec.name for spec in parameter_specs(EpuckWorldParameters)}
-    assert {"exposure_s", "width", "k1", "rate", "first_port"} <= names
 
 
 def test_steering_brings_a_robot_back_onto_the_eight() -> None:

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.shared.parameter_table import markdown_table
 from bench.shared.room_run import placed_world, record_room
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, clearance
 from swarm_loc_drivers.sim.room.sensors import CeilingCameras, Lidar, Radios, sensors_of
-from swarm_loc_drivers.sim.room.world import STEP_NS, RoomWorldParameters, drawn, room_of, room_starts
+from swarm_loc_drivers.sim.room.world import STEP_NS, drawn, room_of, room_starts
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common import se2
@@ -35,11 +34,6 @@ def described(folder: Path, *options: str) -> Swarm:
     file, mapped = folder / "swarm.yaml", ["--map", str(folder / "map.yaml")] if "map" in str(options) else []
     assert new.main([str(file), "--yes", *options, *mapped]) == 0
     return load_swarm(file)
-
-
-def test_the_page_has_all_parameters() -> None:
-    page = Path(__file__).parents[2] / "doc" / "room_world_node.md"
-    assert markdown_table(RoomWorldParameters) in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("plan", FLOOR_PLANS)

@@ -12,11 +12,9 @@ from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
-from bench.shared.parameter_table import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
 from swarm_loc_vision.aerial.ground_control import (
-    AerialParameters,
     ControlPoints,
     Ground,
     GroundFileError,
@@ -101,11 +99,6 @@ class Overhead:
             return False
 
         self._ros.until(happened)
-
-
-def test_the_page_says_what_the_table_says() -> None:
-    page = Path(__file__).parents[2] / "doc" / "aerial_camera_node.md"
-    assert markdown_table(AerialParameters) in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("transport", ["raw", "compressed"])

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +13,6 @@ from compiled_code import compiled_since, printed_by_process, signatures
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.shared.parameter_table import markdown_table
 from bench.vision.scenes import CAMERA, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
@@ -25,7 +23,6 @@ from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
 from swarm_loc_vision.markers.pose import PoseSettings, square
 
-PAGE = Path(__file__).parents[2] / "doc" / "marker_bridge_node.md"
 TAG = "apriltag_36h11"
 LENGTH = 0.05
 DISTORTION = (0.1, -0.05, 0.001, -0.002, 0.0)
@@ -228,10 +225,6 @@ def compiled_late() -> list[str]:
     found = [by_aruco(truth, LENGTH, 2) for truth in truths]
     aruco.detect(SimpleNamespace(header=header(), markers=found, boards=[]))
     return compiled_since(before)
-
-
-def test_the_page_says_what_the_table_says() -> None:
-    assert markdown_table(ForeignParameters) in PAGE.read_text(encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -13,21 +13,31 @@ from swarm_loc_estimator.common.files import FileError
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, save_ground
+from swarm_loc_vision.aerial.ground_control import AerialParameters, FloorMarker, Ground, save_ground
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.events.tracker import EventTrackerParameters, laser_calibration, light_sources
 from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
 from swarm_loc_vision.markers.detector import DetectorParameters, detector_maker, parse_ids, parse_lengths
 from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.foreign_markers import ForeignParameters
 from swarm_loc_vision.sheets import print_markers
 from swarm_loc_vision.sheets.print_markers import board_page, save_pdf
 
-PAGE = Path(__file__).parents[2] / "doc" / "marker_detector_node.md"
+DOC = Path(__file__).parents[2] / "doc"
 FAMILY = "aruco_mip_36h12"
 
 
-def test_the_page_says_what_the_table_says() -> None:
-    assert markdown_table(DetectorParameters) in PAGE.read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("page", "parameters"),
+    [
+        ("marker_detector_node.md", DetectorParameters),
+        ("marker_bridge_node.md", ForeignParameters),
+        ("aerial_camera_node.md", AerialParameters),
+        ("event_tracker_node.md", EventTrackerParameters),
+    ],
+)
+def test_the_page_says_what_the_table_says(page: str, parameters: type) -> None:
+    assert markdown_table(parameters) in (DOC / page).read_text(encoding="utf-8")
 
 
 def test_every_marker_of_the_swarm_has_its_own_size(tmp_path: Path) -> None:
@@ -66,15 +76,6 @@ def test_lengths() -> None:
 def test_what_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(ParameterError):
         parse_lengths([text], 10)
-
-
-DOC = Path(__file__).parents[2] / "doc"
-
-
-def test_the_trackers_page_has_its_parameters() -> None:
-    assert markdown_table(EventTrackerParameters) in (DOC / "event_tracker_node.md").read_text(
-        encoding="utf-8"
-    )
 
 
 def test_the_laser_comes_first_and_lights_by_frequency() -> None:
