@@ -207,18 +207,6 @@ def test_turns_with_one_power_use_their_second_half() -> None:
     assert lab.cables[0].counts["half_exchanges"] == len(lab.found[0]) == pytest.approx(6, abs=2)
 
 
-def test_a_session_ends_with_the_robot_standing() -> None:
-    lab = Lab(world_of(), asking(IDS[1], period_s=1.0)).connected()
-    (cable,) = lab.cables
-    lab.control = lambda: cable.set_velocity((0.01, 0.0, 0.0))
-    lab.run(3.3)
-    cable.session.ending = True
-    lab.until(lambda: cable.session.ended, 3.0)
-    before = lab.world.poses.copy()
-    lab.run(3.0)
-    assert (lab.world.poses == before).all()
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> None:
     lab = Lab(world_of(), asking(IDS[1], period_s=1.0))

@@ -29,10 +29,17 @@ CAMERA = CameraModel(width=320, height=240)
 START = np.array([[0.0, 0.0, 0.3], [0.3, 0.05, 2.0], [-0.4, 0.3, -1.0]])
 
 
-def world_of(errors: ErrorModel = IDEAL, seed: int = 1, start: FloatArray = START) -> EpuckWorld:
+def world_of(
+    errors: ErrorModel = IDEAL,
+    seed: int = 1,
+    start: FloatArray = START,
+    camera: CameraModel = CAMERA,
+    rate: float = 7.5,
+    swarm: Swarm | None = None,
+) -> EpuckWorld:
     arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
-    swarm = describe(EightSettings(robots=len(start)), start)
-    return EpuckWorld(swarm, EpuckWorldSettings(seed, errors, arena, CAMERA, WHEELS, 7.5, 1_000_000_000_000))
+    settings = EpuckWorldSettings(seed, errors, arena, camera, WHEELS, rate, 1_000_000_000_000)
+    return EpuckWorld(swarm or describe(EightSettings(robots=len(start)), start), settings)
 
 
 def run(world: EpuckWorld, duration_s: float) -> list[Exposure]:
@@ -117,27 +124,24 @@ def test_a_picture_is_there_once_its_shutter_has_closed_and_not_before() -> None
 def test_a_picture_shows_where_the_robot_was_when_it_was_taken() -> None:
     """The robot turns; the image equals that of a robot that stands where this one was at the middle."""
     short = replace(CAMERA, exposure_s=1e-5)
-    world = _with_camera(short, START)
+    world = world_of(camera=short)
     world.rates[0] = -60.0, 60.0
     taken = [one for one in run(world, 0.6) if one.robot == 0][-1]
     rate = 2.0 * 60.0 * math.pi * 0.041 / 1000.0 / 0.053
     there = START.copy()
     there[0, 2] += rate * (taken.middle_ns - 1_000_000_000_000) * 1e-9
-    still = _with_camera(short, there)
+    still = world_of(start=there, camera=short)
     same = [one for one in run(still, 0.6) if one.robot == 0][-1]
     difference = world.image(taken).astype(int) - still.image(same).astype(int)
     assert np.abs(difference).max() <= 2
-    later = _with_camera(short, there + np.array([0.0, 0.0, 0.02]))
+    later = world_of(start=there + np.array([0.0, 0.0, 0.02]), camera=short)
     run(later, 0.6)
     assert np.abs(world.image(taken).astype(int) - later.image(same)).max() > 40
 
 
 @pytest.mark.parametrize(("rate", "exposure_s"), [(2.0, 0.133), (2.0, 1e-5), (60.0, 0.133), (60.0, 0.008)])
 def test_the_newest_picture_can_be_drawn_until_the_next_one_is_taken(rate: float, exposure_s: float) -> None:
-    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
-    camera = replace(CAMERA, width=32, height=24, exposure_s=exposure_s)
-    settings = EpuckWorldSettings(1, W2, arena, camera, WHEELS, rate, 1_000_000_000_000)
-    world = EpuckWorld(describe(EightSettings(robots=3), START), settings)
+    world = world_of(W2, camera=replace(CAMERA, width=32, height=24, exposure_s=exposure_s), rate=rate)
     run(world, 0.8)
     for _ in range(5 * round(1e9 / rate) // STEP_NS):
         newest = list(world.newest)
@@ -146,12 +150,6 @@ def test_the_newest_picture_can_be_drawn_until_the_next_one_is_taken(rate: float
             assert exposure is not None
             if world.newest[exposure.robot] is not exposure:
                 assert world.image(exposure).shape == (24, 32)
-
-
-def _with_camera(camera: CameraModel, start: FloatArray) -> EpuckWorld:
-    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
-    settings = EpuckWorldSettings(1, IDEAL, arena, camera, WHEELS, 7.5, 1_000_000_000_000)
-    return EpuckWorld(describe(EightSettings(robots=len(start)), start), settings)
 
 
 def test_the_same_seed_and_commands_give_the_same_world_whoever_looks() -> None:
@@ -189,6 +187,5 @@ def test_a_swarm_that_cannot_be_simulated_is_refused_in_one_sentence(
 ) -> None:
     swarm = describe(EightSettings(robots=2), START[:2])
     lacking = Swarm((replace(swarm.robots[0], **change), swarm.robots[1]), swarm.landmarks)  # type: ignore[arg-type]
-    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
     with pytest.raises(WorldError, match=said):
-        EpuckWorld(lacking, EpuckWorldSettings(1, W0, arena, CAMERA, WHEELS, 7.5, 0))
+        world_of(swarm=lacking)

@@ -80,6 +80,7 @@ ANSWERS = [
     ("!U3", SET),
     ("!X", SET),
     ("?X", GET),
+    ("?M", GET),
     ("x", "?\n"),
 ]
 
@@ -87,6 +88,7 @@ ANSWERS = [
 @pytest.mark.parametrize(("lines", "answer"), ANSWERS, ids=[lines for lines, _ in ANSWERS])
 def test_a_command_line_is_answered_as_by_the_firmware(lines: str, answer: str) -> None:
     assert Bench().say(*lines.split(";")) == answer
+    assert is_refusal(answer.encode()) is (answer != "-E4\n")
 
 
 @pytest.mark.parametrize(
@@ -178,8 +180,3 @@ def test_the_first_firmware_stops_for_the_brake_and_knows_no_decay() -> None:
     assert bench.say(BRAKE.decode()) == ""
     assert bench.duties == (0.0, 0.0)
     assert bench.say("!MVD0=5") == SET
-
-
-@pytest.mark.parametrize("line", ["!M2=%30", "!E5", "?M", "x", "!PD=5"])
-def test_the_driver_knows_a_refusal(line: str) -> None:
-    assert is_refusal(Bench().say(line).encode())

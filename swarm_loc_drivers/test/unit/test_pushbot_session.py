@@ -140,9 +140,10 @@ def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
     wire.velocities = (0, 0)
     wire.run(0.9)
     assert wire.counts["ignored_stops"] == 0
-    wire.run(2.0)
+    wire.run(0.5)
     assert wire.session.does_not_stop
     assert wire.counts["ignored_stops"] == 1
+    wire.run(1.5)
     assert 20 < wire.counts["repeated_stops"] <= 30
     driver._serve(wire.session)
     assert driver.warning == NO_STOP
@@ -150,19 +151,6 @@ def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
     wire.run(1.5)
     assert wire.errors == [NO_STOP]
     assert wire.session.ended
-    assert wire.speed == 0.0
-
-
-def test_a_robot_that_stops_no_more_is_reset_in_time_at_the_end() -> None:
-    wire = streaming(generation=FIRST_FIRMWARE)
-    wire.velocities = (30, 30)
-    wire.run(0.5)
-    deaf_to_stops(wire)
-    wire.session.ending = True
-    wire.run(0.9)
-    assert not wire.errors
-    wire.run(0.5)
-    assert wire.errors == [NO_STOP]
     assert wire.speed == 0.0
 
 
@@ -309,10 +297,9 @@ def test_lines_that_are_no_ticks_are_counted() -> None:
 
 
 def test_polarity_is_a_choice() -> None:
-    on, off = streaming({"on_bit": 0}), streaming({"on_bit": 1})
-    for wire, other in ((on, off),):
+    is_on = []
+    for bit in (0, 1):
+        wire = streaming({"on_bit": bit})
         wire.run(0.2)
-        other.run(0.2)
-        one = decode_events(wire.packets[-1].data, ENCODING, (128, 128))
-        two = decode_events(other.packets[-1].data, ENCODING, (128, 128))
-        np.testing.assert_array_equal(one.is_on, ~two.is_on)
+        is_on.append(decode_events(wire.packets[-1].data, ENCODING, (128, 128)).is_on)
+    np.testing.assert_array_equal(is_on[0], ~is_on[1])

@@ -12,7 +12,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from render_helpers import LANDMARK_SIZE, RayCaster, camera_matrix, pixels_of, small_arena
 
-from bench.scenarios.eight_run import CAMERA, VIEW, EightSettings, describe, simulate_eight, wall_markers
+from bench.scenarios.eight_run import CAMERA, VIEW, EightSettings, simulate_eight, wall_markers
 from bench.scenarios.lived_run import SIGHTING_DTYPE, SimulatedRun
 from bench.scenarios.sightings import View, deliver, hidden, schedule_exposures
 from swarm_loc_drivers.sim.render import scene as scenery
@@ -243,22 +243,6 @@ def _rays(camera: RobotCamera, model: CameraModel, pose: FloatArray, pixels: Flo
     return rays
 
 
-def test_a_nearer_robot_hides_a_marker_and_a_farther_one_does_not() -> None:
-    scene = small_arena(2)
-    camera = RobotCamera(0, SHARP, CAMERA)
-    sees_marker_107 = np.array([0.6, -0.2, 0.0])  # the marker stands at (1.2, -0.2)
-    renderer = Renderer(scene, SHARP)
-
-    def around(other: tuple[float, float, float]) -> FloatArray:
-        poses = np.array([[sees_marker_107, other]])
-        return renderer.light(camera, poses)[200:280, 280:360].astype(float)
-
-    alone, behind, before = around((-0.5, 0.3, 0.0)), around((0.3, -0.2, 0.0)), around((0.9, -0.2, 0.3))
-    np.testing.assert_allclose(alone, behind, atol=1e-6)
-    assert np.abs(before - alone).mean() > 0.05
-    assert alone.min() == pytest.approx(scenery.BLACK, abs=1e-4)
-
-
 @pytest.mark.parametrize("shift", [0.0, 37.0, -211.0])
 def test_a_part_of_a_picture_is_the_picture_of_that_part(shift: float) -> None:
     """What leaves the image at its sides does not disturb what stays."""
@@ -362,19 +346,6 @@ def test_noise_is_that_of_photons_and_read_out() -> None:
     assert bright.mean() == pytest.approx(1.0, abs=0.03)
 
 
-def test_a_shorter_exposure_is_as_bright_and_noisier() -> None:
-    eye_of = {s: replace(SHARP, exposure_s=s) for s in (0.001, 0.016)}
-    frames = {
-        s: Renderer(small_arena(1), model).frame(
-            RobotCamera(0, model, CAMERA), turning(0.0, 1), np.random.default_rng(1)
-        )
-        for s, model in eye_of.items()
-    }
-    flat = (slice(2, 18), slice(300, 340))
-    assert frames[0.001][flat].mean() == pytest.approx(frames[0.016][flat].mean(), abs=1.0)
-    assert frames[0.001][flat].std() > 2.5 * frames[0.016][flat].std()
-
-
 def test_light_falls_towards_the_edge_as_cos_to_the_fourth() -> None:
     full = replace(SHARP, vignetting=1.0)
     light = full.electrons() / (full.white_flux * full.exposure_s)
@@ -382,13 +353,6 @@ def test_light_falls_towards_the_edge_as_cos_to_the_fourth() -> None:
     angle = math.atan2(math.hypot(319.5, 239.5), full.camera.fx)
     assert light[0, 0] == pytest.approx(math.cos(angle) ** 4, rel=1e-5)
     assert (replace(SHARP, vignetting=0.0).electrons() == 8000.0).all()
-
-
-def test_the_same_seed_gives_the_same_frame(renderer: Renderer) -> None:
-    camera = RobotCamera(0, SHARP, CAMERA)
-    one, same, other = (renderer.frame(camera, turning(0.01, 5), np.random.default_rng(s)) for s in (3, 3, 4))
-    np.testing.assert_array_equal(one, same)
-    assert (one != other).mean() > 0.3
 
 
 def test_a_drawn_picture_leaves_nothing_behind(renderer: Renderer) -> None:
@@ -573,10 +537,3 @@ def test_odometry_comes_at_its_rate_from_every_robot(rate_hz: float) -> None:
         assert stamps[0] == run.start_ns
         assert (np.diff(stamps[1:]) == round(1e9 / rate_hz)).all()
         np.testing.assert_array_equal(own["pose"][own["stamp_ns"] == run.start_ns][0], 0.0)
-
-
-def test_an_unknown_start_stays_out_of_the_description() -> None:
-    settings = EightSettings(start_known=False)
-    swarm = describe(settings, np.zeros((5, 3)))
-    assert all(robot.start is None for robot in swarm.robots)
-    assert len(swarm.owner_of) == 5 * 5 + 20

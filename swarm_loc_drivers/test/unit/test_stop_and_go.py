@@ -42,10 +42,14 @@ class Robot:
         while self.step():
             pass
 
-    def go(self, x: float, y: float) -> None:
-        """Send it, from where it truly is, and let it go and look around."""
+    def send(self, x: float, y: float) -> None:
+        """Send it, from where it truly is."""
         pose = np.array([*self.pose[:2], wrap_angle(self.pose[2])])
         assert self.motion.take_goal(MapGoal(self.now_ns, pose, np.array([x, y])))
+
+    def go(self, x: float, y: float) -> None:
+        """Send it, and let it go and look around."""
+        self.send(x, y)
         self.until_still()
 
 
@@ -92,9 +96,7 @@ def test_a_goal_ends_the_look_around_before() -> None:
     robot.motion.take_goal(MapGoal(robot.now_ns, robot.pose.copy(), np.array([1.0, 2.0])))
     for _ in range(300):
         robot.step()
-    pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])
-    assert robot.motion.take_goal(MapGoal(robot.now_ns, pose, np.array([1.5, 1.5])))
-    robot.until_still()
+    robot.go(1.5, 1.5)
     assert math.dist(robot.pose[:2], (1.5, 1.5)) < 0.02
 
 
@@ -129,14 +131,14 @@ def test_where_two_scans_bring_no_goal_it_looks_from_another_place() -> None:
 
 def test_something_ahead_ends_a_drive_and_it_looks_around_there() -> None:
     robot = looked_around()
-    pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])
-    robot.motion.take_goal(MapGoal(robot.now_ns, pose, pose[:2] + np.array([1.0, 0.0])))
-    while math.dist(robot.pose[:2], pose[:2]) < 0.4:
+    place = robot.pose[:2].copy()
+    robot.send(place[0] + 1.0, place[1])
+    while math.dist(robot.pose[:2], place) < 0.4:
         robot.step()
     robot.motion.take_distance(SETTINGS.clearance - 0.01)
     before = robot.turned
     robot.until_still()
-    assert math.dist(robot.pose[:2], pose[:2]) < 0.42
+    assert math.dist(robot.pose[:2], place) < 0.42
     assert robot.turned - before == pytest.approx(SCAN_TURN, abs=0.03)
     assert robot.motion.halts == 1
 
@@ -145,14 +147,14 @@ def test_something_ahead_ends_a_drive_and_it_looks_around_there() -> None:
 def test_a_body_that_is_held_ends_a_drive(distance: float) -> None:
     """It touches the edge of an obstacle beside its laser; then what is ahead comes no nearer."""
     robot, rng = looked_around(), np.random.default_rng(3)
-    pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])
-    robot.motion.take_goal(MapGoal(robot.now_ns, pose, pose[:2] + np.array([1.0, 0.0])))
-    while (way := math.dist(robot.pose[:2], pose[:2])) < 0.95 and not robot.motion.halts:
+    place = robot.pose[:2].copy()
+    robot.send(place[0] + 1.0, place[1])
+    while (way := math.dist(robot.pose[:2], place)) < 0.95 and not robot.motion.halts:
         robot.step()
         left = distance + max(0.0, 0.3 - way)
         robot.motion.take_distance(left + 0.016 * left**2 * rng.standard_normal())
     assert robot.motion.halts == 1
-    assert math.dist(robot.pose[:2], pose[:2]) - 0.3 < 0.06 + 0.09 * distance**2
+    assert math.dist(robot.pose[:2], place) - 0.3 < 0.06 + 0.09 * distance**2
 
 
 def test_nothing_seen_ahead_is_no_obstacle() -> None:
@@ -178,8 +180,7 @@ def test_a_goal_that_comes_again_counts_once() -> None:
 
 def test_odometry_that_comes_late_changes_nothing() -> None:
     robot = looked_around()
-    pose = np.array([*robot.pose[:2], wrap_angle(robot.pose[2])])
-    robot.motion.take_goal(MapGoal(robot.now_ns, pose, np.array([1.6, 2.0])))
+    robot.send(1.6, 2.0)
     for _ in range(50):
         robot.step()
     before = robot.motion.command(robot.now_ns, robot.odometry)

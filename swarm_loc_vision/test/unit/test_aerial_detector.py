@@ -103,11 +103,6 @@ def test_a_size_by_which_nothing_was_found_is_forgotten(monkeypatch: pytest.Monk
     assert score_picture(picture, detector.detect(picture.gray)).missed == 0
 
 
-def test_a_square_of_the_size_of_robots_is_none() -> None:
-    picture = draw_picture(Look(kind="lid", diameter_px=32.0, robots=16, touching=1.0, shadow=0.4), seed=2)
-    assert scored(picture).false == 0
-
-
 def test_the_polarity_can_be_told() -> None:
     picture = draw_picture(Look(kind="dark"), seed=5)
     assert scored(picture, polarity="dark").missed == 0

@@ -176,15 +176,6 @@ def test_a_distorting_lens_does_not_matter() -> None:
     assert checked >= 6
 
 
-def test_only_ids_in_use_are_found() -> None:
-    family = family_named("artoolkit_bch_thin")
-    image, truths = random_scene(np.random.default_rng(8), family, 12, Look())
-    used = np.array([truths[0].marker_id, truths[1].marker_id])
-    detections = MarkerDetector(DetectorSettings(), {family: used}).detect(image)
-    assert sorted(detections.id.tolist()) == sorted(used.tolist())
-    assert detections.poses is None
-
-
 def half_in_shadow(image: Gray) -> Gray:
     """Stripes of shadow, as of blinds, each as wide as three markers or so."""
     u = np.arange(WIDTH)

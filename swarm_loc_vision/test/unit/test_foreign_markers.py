@@ -125,17 +125,6 @@ def test_poses_of_aruco_get_the_size_of_each_marker(family: str, quarters: int) 
     check_poses(rows, truths, 2e-3, 0.02)
 
 
-def test_opencv_reads_apriltags_upside_down() -> None:
-    image, truths, _ = scene()
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
-    found = dict(zip(np.ravel(ids).tolist(), corners, strict=True))
-    seen = [truth for truth in truths if truth.marker_id in found]
-    assert len(seen) > len(truths) / 2
-    for truth in seen:
-        assert np.roll(found[truth.marker_id][0], 2, axis=0) == pytest.approx(truth.corners, abs=3.0)
-
-
 def test_the_distortion_is_removed_unless_images_are_rectified() -> None:
     _, (truth, *_), _ = scene()
     lengths = (f"{truth.marker_id}:{truth.length:.6f}",)

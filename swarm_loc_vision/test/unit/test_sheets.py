@@ -99,20 +99,6 @@ def test_every_marker_of_a_printed_sheet_is_read_where_it_is(name: str) -> None:
     assert sorted(read) == IDS
 
 
-@pytest.mark.parametrize(
-    ("name", "of_opencv"),
-    [("aruco_mip_36h12", "DICT_ARUCO_MIP_36h12"), ("apriltag_36h11", "DICT_APRILTAG_36h11")],
-)
-def test_opencv_reads_them_too(name: str, of_opencv: str) -> None:
-    aruco = getattr(cv2, "aruco", None)
-    if not hasattr(aruco, of_opencv) or not hasattr(aruco, "ArucoDetector"):
-        pytest.skip(f"OpenCV {cv2.__version__} does not have {of_opencv}")
-    (page,) = pages_of(stickers_of(SWARM), family_named(name), "a4")
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, of_opencv)))
-    _, ids, _ = detector.detectMarkers(photograph(page, name))
-    assert sorted(np.ravel(ids).tolist()) == IDS
-
-
 def test_pieces_lie_on_the_paper_and_apart() -> None:
     family = family_named("artoolkit_bch_thin")
     robots = [Robot(f"r{k}", faces=(Face("a", 2 * k, size=0.02), Face("b", 2 * k + 1))) for k in range(40)]
