@@ -8,8 +8,9 @@ from geometry_msgs.msg import PoseStamped
 from node_world import stamp_ns
 
 from bench.scenarios.eight_run import EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import eight_starts
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.offline.live_run import LiveGraph
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
@@ -19,43 +20,43 @@ from swarm_loc_msgs.msg import MarkerDetectionArray
 PATIENCE_S = 100.0
 # No data are too old, however long a busy machine stands still
 PARAMETERS = (
-    "epuck_world: {ros__parameters: {width: 640, height: 480}}\n"
+    "epuck_world: {ros__parameters: {width: 640, height: 480, aerial_width: 640, aerial_height: 480}}\n"
     "estimator: {ros__parameters: {horizon_s: 20.0}}\n"
 )
 
 
 @pytest.mark.timeout(300)  # the renderer may have to be compiled first
-def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
-    eight = Lemniscate(HALF_WIDTH)
-    start, _ = eight.at(np.array([0.0, 0.5 * eight.length]))
-    swarm = describe(EightSettings(robots=2), start)
+@pytest.mark.parametrize(("robots", "aerial"), [(2, False), (3, True)], ids=["own cameras", "camera above"])
+def test_robots_are_located_by_cameras(tmp_path: Path, robots: int, *, aerial: bool) -> None:
+    """The camera above cannot tell robots apart, and nobody knows where they begin."""
+    swarm = describe(EightSettings(robots=robots), eight_starts(robots))
     save_swarm(swarm, tmp_path / "swarm.yaml")
     (tmp_path / "parameters.yaml").write_text(PARAMETERS, encoding="utf-8")
     (tmp_path / "links").mkdir()
-    options = SimulationOptions(
-        str(tmp_path / "swarm.yaml"), world="w0", parameter_file=str(tmp_path / "parameters.yaml")
-    )
-    nodes = graph_of(options, swarm, str(tmp_path / "links"))
-    truth: dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]] = {}
+    files = {name: str(tmp_path / f"{name}.yaml") for name in ("swarm", "parameters")}
+    options = SimulationOptions(files["swarm"], world="w0", aerial=aerial, parameter_file=files["parameters"])
+    truth: list[dict[int, tuple[float, float]]] = [{} for _ in range(robots)]
     seen: list[MarkerDetectionArray] = []
 
-    def on_truth(message: PoseStamped) -> None:
-        truth[stamp_ns(message)] = np.array([message.pose.position.x, message.pose.position.y])
-
-    with LiveGraph(nodes, tmp_path / "nodes.log") as graph:
+    with LiveGraph(graph_of(options, swarm, str(tmp_path / "links")), tmp_path / "nodes.log") as graph:
         recorder = graph.recorder
-        recorder.create_subscription(PoseStamped, "epuck1/ground_truth", on_truth, 1000)
         recorder.create_subscription(MarkerDetectionArray, "epuck1/detections", seen.append, 1000)
+        for name, places in zip([one.name for one in swarm.robots], truth, strict=True):
+
+            def on_truth(message: PoseStamped, places: dict[int, tuple[float, float]] = places) -> None:
+                places[stamp_ns(message)] = (message.pose.position.x, message.pose.position.y)
+
+            recorder.create_subscription(PoseStamped, f"{name}/ground_truth", on_truth, 1000)
 
         def has_driven() -> bool:
-            return bool(truth) and float(np.linalg.norm(next(reversed(truth.values())) - start[0, :2])) > 0.1
+            return all(truth) and bool(np.ptp([*truth[0].values()], axis=0).max() > 0.1)
 
         graph.wait_for(has_driven, "drive", PATIENCE_S)
-        driven_ns = max(truth)
+        driven_ns = max(map(max, truth))
 
         def tracked() -> list[EstimateMessage]:
             """Poses from then on at which all robots are tracked, and where the truth is known."""
-            newest_ns = next(reversed(truth))
+            newest_ns = min(map(max, truth))
             return [
                 one
                 for one in recorder.poses()
@@ -64,13 +65,22 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
 
         graph.wait_for(lambda: len(tracked()) >= 20, "be located", PATIENCE_S)
         located = tracked()[-20:]
-    stamps, places = np.array(list(truth)), np.array(list(truth.values()))
-    errors = [
-        np.hypot(*(one.pose[0, axis] - np.interp(one.stamp_ns, stamps, places[:, axis]) for axis in (0, 1)))
-        for one in located
-    ]
-    assert np.median(errors) < 0.02
-    assert sum(len(array.detections) for array in seen) > len(seen)
+
+    def place(robot: int, at_ns: int) -> FloatArray:
+        stamps, places = np.array([*truth[robot]]), np.array([*truth[robot].values()])
+        return np.array([np.interp(at_ns, stamps, places[:, axis]) for axis in (0, 1)])
+
+    errors = np.array(
+        [
+            [np.linalg.norm(one.pose[robot, :2] - place(robot, one.stamp_ns)) for robot in range(robots)]
+            for one in located
+        ]
+    )
+    assert np.median(errors, axis=0).max() < 0.02
+    if aerial:
+        assert errors[-10:].max() < 0.02
+    else:
+        assert sum(len(array.detections) for array in seen) > len(seen)
     log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
     assert "dropped" not in log
     assert "simulated time continues without" not in log

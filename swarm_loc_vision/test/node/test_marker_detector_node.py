@@ -65,22 +65,25 @@ def camera_info(**changes: Any) -> CameraInfo:
 class Camera:
     """A camera's driver, heard by a node, and what the node says."""
 
-    def __init__(self, ros: Ros, qos: QoSProfile = qos_profile_sensor_data, **parameters: Any) -> None:
-        self._ros = ros
-        node = MarkerDetectorNode(parameter_overrides=overrides(family=FAMILY, **parameters))
-        ros.add(node)
+    def __init__(
+        self, ros: Ros, qos: QoSProfile = qos_profile_sensor_data, namespace: str = "", **parameters: Any
+    ) -> None:
+        self._ros, self._name = ros, f"{namespace}/marker_detector".strip("/")
+        given = overrides(family=FAMILY, **parameters)
+        ros.add(MarkerDetectorNode(namespace=namespace, parameter_overrides=given))
         tester = ros.tester
         kind, topic = (
             (CompressedImage, "image_raw/compressed")
             if parameters.get("image_transport") == "compressed"
             else (Image, "image_raw")
         )
-        self.images = tester.create_publisher(kind, topic, qos)
-        self._info = tester.create_publisher(CameraInfo, "camera_info", qos)
-        self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
+        self.images = tester.create_publisher(kind, f"{namespace}/{topic}", qos)
+        self._info = tester.create_publisher(CameraInfo, f"{namespace}/camera_info", qos)
+        found = f"{namespace}/detections"
+        self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, found)
         self._diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
         ros.until(lambda: self.images.get_subscription_count() and self._info.get_subscription_count())
-        ros.until(lambda: tester.count_publishers("detections") and tester.count_publishers("/diagnostics"))
+        ros.until(lambda: tester.count_publishers(found) and tester.count_publishers("/diagnostics"))
 
     def calibrate(self, message: CameraInfo, words: str) -> None:
         """Publish a calibration until the node tells of it in its diagnostics."""
@@ -88,7 +91,7 @@ class Camera:
 
     def status(self) -> DiagnosticStatus:
         """The newest diagnostics."""
-        return newest_status(self._diagnostics, "marker_detector")
+        return newest_status(self._diagnostics, self._name)
 
     def values(self) -> dict[str, str]:
         """Its figures."""
@@ -272,22 +275,9 @@ def test_a_fixed_camera_has_the_detector_in_its_namespace(ros: Ros, tmp_path: Pa
         "cameras: {ceiling1: {x: 0.0, y: 0.0, z: 2.5}}\n",
         encoding="utf-8",
     )
-    given = overrides(family=FAMILY, swarm_file=str(path), robot="ceiling1", tilt_sigma=0.02)
-    arguments = ["--ros-args", "-r", "__ns:=/ceiling1"]
-    ros.add(MarkerDetectorNode(parameter_overrides=given, cli_args=arguments))
-    pictures = ros.tester.create_publisher(Image, "/ceiling1/image_raw", qos_profile_sensor_data)
-    info = ros.tester.create_publisher(CameraInfo, "/ceiling1/camera_info", qos_profile_sensor_data)
-    heard: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "/ceiling1/detections")
-    ros.until(lambda: pictures.get_subscription_count() and info.get_subscription_count())
-    ros.until(lambda: ros.tester.count_publishers("/ceiling1/detections"))
-
-    def seen() -> bool:
-        info.publish(camera_info())
-        pictures.publish(image(1))
-        return bool(heard)
-
-    ros.until(seen)
-    assert sorted(detection.id for detection in heard[-1].detections) == sorted(ids)
+    camera = Camera(ros, namespace="/ceiling1", swarm_file=str(path), robot="ceiling1", tilt_sigma=0.02)
+    camera.calibrate(camera_info(), "image_raw")
+    assert sorted(detection.id for detection in camera.see(image(1)).detections) == sorted(ids)
 
 
 def test_a_detector_detects_while_it_is_active(ros: Ros, tmp_path: Path) -> None:
