@@ -77,11 +77,16 @@ def test_headings_are_clockwise_from_y_which_points_down(heading: float, yaw: fl
     assert pose_of({"last_seen": 1.0}) is None
 
 
-def test_poses_are_fixes_and_velocities_are_speeds_of_wheels(ros: Ros, tmp_path: Path, url: str) -> None:
-    swarm_file = tmp_path / "swarm.yaml"
-    assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
+@pytest.fixture
+def swarm_file(tmp_path: Path) -> str:
+    path = str(tmp_path / "swarm.yaml")
+    assert new.main([path, "--yes", "--type", "dotbot", "--robots", "2"]) == 0
+    return path
+
+
+def test_poses_are_fixes_and_velocities_are_speeds_of_wheels(ros: Ros, swarm_file: str, url: str) -> None:
     fixes = [ros.listen(PoseWithCovarianceStamped, f"dotbot{k}/fix") for k in (1, 2)]
-    node = DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), url=url))
+    node = DotbotNode(parameter_overrides=overrides(swarm_file=swarm_file, url=url))
     ros.add(node)
     ros.until(lambda: all(fixes))
     assert planar_pose(fixes[0][0].pose.pose)[:2] == (1.0, -0.5)
@@ -101,15 +106,13 @@ def test_poses_are_fixes_and_velocities_are_speeds_of_wheels(ros: Ros, tmp_path:
 @pytest.fixture
 def node(
     ros: Ros,  # noqa: ARG001  # must run before
-    tmp_path: Path,
+    swarm_file: str,
     url: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> DotbotNode:
     """The node of two robots, which has not asked yet."""
-    swarm_file = tmp_path / "swarm.yaml"
-    assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
     monkeypatch.setattr(Controller, "robots", [])
-    return DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), url=url))
+    return DotbotNode(parameter_overrides=overrides(swarm_file=swarm_file, url=url))
 
 
 @pytest.mark.parametrize(
@@ -175,9 +178,7 @@ def test_a_robot_keeps_its_address_when_another_one_is_gone(
 )
 @pytest.mark.usefixtures("ros")
 def test_a_wrong_parameter_is_one_sentence(
-    tmp_path: Path, parameters: dict[str, object], sentence: str
+    swarm_file: str, parameters: dict[str, object], sentence: str
 ) -> None:
-    swarm_file = tmp_path / "swarm.yaml"
-    assert new.main([str(swarm_file), "--yes", "--type", "dotbot", "--robots", "2"]) == 0
     with pytest.raises(ParameterError, match=sentence):
-        DotbotNode(parameter_overrides=overrides(swarm_file=str(swarm_file), **parameters))
+        DotbotNode(parameter_overrides=overrides(swarm_file=swarm_file, **parameters))

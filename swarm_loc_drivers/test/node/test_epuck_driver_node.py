@@ -16,7 +16,7 @@ from epuck_body import GEOMETRY
 from epuck_rig import SQUARE
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
-from node_world import Program, Ros
+from node_world import Program, Ros, newest_status, stamp_ns, values_of
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Range
 from tcp_link import TcpLink
@@ -25,6 +25,7 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.poses import planar_pose
 
 
 class Controller:
@@ -51,42 +52,30 @@ class Controller:
         self.ros.until(lambda: self.odometry)
         for speed, turn_rate, amount in legs:
             self.velocity = (speed, turn_rate)
-            self._until_gone(pose_of(self.odometry[-1]), amount, turning=bool(turn_rate))
+            self._until_gone(planar_pose(self.odometry[-1].pose.pose), amount, turning=bool(turn_rate))
         self.velocity = (0.0, 0.0)
         self.ros.until(lambda: not any(is_moving(message) for message in self.odometry[-3:]))
 
     def _until_gone(self, start: FloatArray, amount: float, *, turning: bool) -> None:
         def gone() -> float:
-            step = se2.between(start, pose_of(self.odometry[-1]))
+            step = se2.between(start, planar_pose(self.odometry[-1].pose.pose))
             return abs(float(step[2])) if turning else math.hypot(step[0], step[1])
 
         self.ros.until(lambda: gone() >= amount)
 
-    def status(self) -> DiagnosticStatus | None:
-        """The newest of the driver."""
-        found = [s for message in self.diagnostics for s in message.status if s.name == "epuck1/epuck_driver"]
-        return found[-1] if found else None
+    def until_status(self, level: bytes) -> DiagnosticStatus:
+        """Wait for a level; the diagnostics."""
 
-    def until_status(self, level: bytes) -> None:
-        """Wait for a level."""
+        def newest() -> DiagnosticStatus:
+            return newest_status(self.diagnostics, "epuck1/epuck_driver")
 
-        def is_so() -> bool:
-            status = self.status()
-            return status is not None and status.level == level
-
-        self.ros.until(is_so)
+        self.ros.until(lambda: newest().name and newest().level == level)
+        return newest()
 
 
 def is_moving(message: Odometry) -> bool:
     twist = message.twist.twist
     return bool(twist.linear.x or twist.angular.z)
-
-
-def pose_of(message: Odometry) -> FloatArray:
-    pose = message.pose.pose
-    return np.array(
-        [pose.position.x, pose.position.y, 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)]
-    )
 
 
 Start = Callable[..., Any]
@@ -146,9 +135,9 @@ def test_a_square(ros: Ros, robot: Start, driver: Start, over: str) -> None:
     controller.drive(SQUARE)
 
     first, last = controller.odometry[0], controller.odometry[-1]
-    assert not pose_of(first).any()
+    assert not any(planar_pose(first.pose.pose))
     assert (last.header.frame_id, last.child_frame_id) == ("epuck1/odom", "epuck1/base_link")
-    error = se2.between(emulated.truth()["pose"], pose_of(last))
+    error = se2.between(emulated.truth()["pose"], planar_pose(last.pose.pose))
     step = GEOMETRY.metres_per_step
     assert math.hypot(error[0], error[1]) <= 20 * step
     assert abs(error[2]) <= 2.1 * step / GEOMETRY.wheel_separation
@@ -156,9 +145,7 @@ def test_a_square(ros: Ros, robot: Start, driver: Start, over: str) -> None:
     covariance = np.array(last.pose.covariance).reshape(6, 6)
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
     assert covariance[5, 5] > 10 * np.array(first.pose.covariance)[35]
-    stamps = [
-        message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in controller.odometry
-    ]
+    stamps = [stamp_ns(message) for message in controller.odometry]
     assert (np.diff(stamps) > 0).all()
     assert abs(ros.tester.get_clock().now().nanoseconds - stamps[-1]) < 60 * 10**9
 
@@ -177,10 +164,7 @@ def test_a_square(ros: Ros, robot: Start, driver: Start, over: str) -> None:
     assert newest["epuck1/ps3"] == math.inf
     assert 0.005 < newest["epuck1/ps7"] < newest["epuck1/ps0"] < 0.06
 
-    controller.until_status(DiagnosticStatus.OK)
-    status = controller.status()
-    assert status is not None
-    values = {pair.key: pair.value for pair in status.values}
+    values = values_of(controller.until_status(DiagnosticStatus.OK))
     assert values["connections"] == "1"
     assert float(values["readings rate [1/s]"]) > 1.0
     assert "implausible_counters" not in values
@@ -256,16 +240,13 @@ def test_a_robot_that_dies_is_told_and_found_again(ros: Ros, robot: Start, drive
     controller.drive(SQUARE[:1])
     controller.until_status(DiagnosticStatus.OK)
     emulated.kill()
-    controller.until_status(DiagnosticStatus.ERROR)
-    status = controller.status()
-    assert status is not None
-    assert emulated.place in status.message
-    count, end = len(controller.odometry), pose_of(controller.odometry[-1])
+    assert emulated.place in controller.until_status(DiagnosticStatus.ERROR).message
+    count, end = len(controller.odometry), planar_pose(controller.odometry[-1].pose.pose)
 
     again = robot(over, emulated.place)
     controller.until_status(DiagnosticStatus.OK)
     ros.until(lambda: len(controller.odometry) > count)
-    assert pose_of(controller.odometry[count]) == pytest.approx(end, abs=1e-9)
+    assert planar_pose(controller.odometry[count].pose.pose) == pytest.approx(end, abs=1e-9)
     controller.drive(SQUARE[:1])
-    driven = se2.between(end, pose_of(controller.odometry[-1]))
+    driven = se2.between(end, planar_pose(controller.odometry[-1].pose.pose))
     assert driven == pytest.approx(again.truth()["pose"], abs=5e-3)

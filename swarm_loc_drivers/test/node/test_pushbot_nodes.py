@@ -2,7 +2,7 @@
 
 import math
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, Vector3
 from nav_msgs.msg import OccupancyGrid, Odometry
-from node_world import Program, Ros, stamp_ns, values_of
+from node_world import Program, Ros, newest_status, stamp_ns, values_of
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
@@ -116,10 +116,9 @@ class Hall:
         speed, turn_rate = self.velocity
         self._publisher.publish(Twist(linear=Vector3(x=speed), angular=Vector3(z=turn_rate)))
 
-    def status(self, name: str) -> DiagnosticStatus | None:
+    def status(self, name: str) -> DiagnosticStatus:
         """The newest diagnostics of a node."""
-        found = [one for array in self.diagnostics for one in array.status if one.name == f"pushbot1/{name}"]
-        return found[-1] if found else None
+        return newest_status(self.diagnostics, f"pushbot1/{name}")
 
     def moved(self) -> float:
         """How far the robot truly is from where it began [m]."""
@@ -213,14 +212,12 @@ def test_a_world_that_goes_and_comes_back_is_connected_anew(
     with ExitStack() as running:
         hall = Hall(ros, running, tmp_path, swarm_file, "serial")
         hall.start_driver(use_sim_time="false")
-        ros.until(lambda: (status := hall.status("pushbot_driver")) and status.level == DiagnosticStatus.OK)
+        ros.until(lambda: hall.status("pushbot_driver").message == "connected")
         hall.world.end(signal.SIGINT)
-        ros.until(
-            lambda: (status := hall.status("pushbot_driver")) and status.level == DiagnosticStatus.ERROR
-        )
+        ros.until(lambda: hall.status("pushbot_driver").level == DiagnosticStatus.ERROR)
         parameters = {"swarm_file": swarm_file, "seed": SEED, "link_folder": tmp_path}
         hall.start("pushbot_world_node", parameters, "")
-        ros.until(lambda: (status := hall.status("pushbot_driver")) and status.level == DiagnosticStatus.OK)
+        ros.until(lambda: hall.status("pushbot_driver").message == "connected")
         before = stamp_ns(hall.odometry[-1])
         ros.until(lambda: stamp_ns(hall.odometry[-1]) > before)
 
@@ -230,29 +227,32 @@ def test_a_laser_that_is_never_seen_is_named(ros: Ros, tmp_path: Path, swarm_fil
         hall = Hall(ros, running, tmp_path, swarm_file, "tcp")
         hall.start_driver(laser_frequency=0.0)
         hall.start_tracker()
-
-        def is_named() -> bool:
-            status = hall.status("event_tracker")
-            return status is not None and "450 Hz has not been seen" in status.message
-
-        ros.until(is_named)
+        ros.until(lambda: "450 Hz has not been seen" in hall.status("event_tracker").message)
         assert all(math.isnan(one.distance) and one.covariance[0] == -1.0 for one in hall.laser)
+
+
+def simulated_graph(folder: Path) -> Sequence[NodeSpec]:
+    """The nodes of `simulate` for one robot."""
+    (folder / "swarm.yaml").write_text(SIMULATED, encoding="utf-8")
+    options = SimulationOptions(str(folder / "swarm.yaml"), seed=5, rate=2.0)
+    return graph_of(options, simulated_swarm(options), str(folder))
+
+
+def start_of(running: ExitStack, folder: Path, spec: NodeSpec) -> Program:
+    log = folder / f"{spec.name}.log"
+    return running.enter_context(Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package))
 
 
 @pytest.mark.timeout(300)  # a minute of the simulation, however slow the machine
 def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path) -> None:
     """The whole graph of `simulate`: serial ports, lasers, trackers, mapper, estimator, and who drives."""
-    swarm = tmp_path / "swarm.yaml"
-    swarm.write_text(SIMULATED, encoding="utf-8")
-    options = SimulationOptions(str(swarm), seed=5, rate=2.0)
     distances: list[LaserDistance] = ros.listen(LaserDistance, "a/laser")
     truths: list[PoseStamped] = ros.listen(PoseStamped, "a/ground_truth")
     goals: list[PoseStamped] = ros.listen(PoseStamped, "a/goal")
     poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
     with ExitStack() as running:
-        for spec in graph_of(options, simulated_swarm(options), str(tmp_path)):
-            log = tmp_path / f"{spec.name}.log"
-            running.enter_context(Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package))
+        for spec in simulated_graph(tmp_path):
+            start_of(running, tmp_path, spec)
         ros.until(lambda: sum(one.distance > 0.0 for one in distances) > 20)
         # The second look around ends at 62 s of simulated time, which passes as fast as the machine allows.
         ros.until(lambda: len(goals) > 1 or (truths and stamp_ns(truths[-1]) > 90e9), patience_s=240.0)
@@ -272,9 +272,6 @@ def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path
 def test_a_robot_whose_driver_is_killed_while_it_maps_is_lost_until_its_scans_tell_where_it_is(
     ros: Ros, tmp_path: Path
 ) -> None:
-    swarm = tmp_path / "swarm.yaml"
-    swarm.write_text(SIMULATED, encoding="utf-8")
-    options = SimulationOptions(str(swarm), seed=5, rate=2.0)
     truths: list[PoseStamped] = ros.listen(PoseStamped, "a/ground_truth")
     fixes: list[PoseWithCovarianceStamped] = ros.listen(PoseWithCovarianceStamped, "a/fix")
     goals: list[PoseStamped] = ros.listen(PoseStamped, "a/goal")
@@ -283,8 +280,7 @@ def test_a_robot_whose_driver_is_killed_while_it_maps_is_lost_until_its_scans_te
 
     def counted(name: str) -> int:
         """A counter of the mapper."""
-        found = [one for array in diagnostics for one in array.status if one.name == "mapper"]
-        return int(values_of(found[-1])[name]) if found else 0
+        return int(values_of(newest_status(diagnostics, "mapper")).get(name, 0))
 
     def has_driven(since: int) -> bool:
         """Whether the robot has left the place where it was when there were so many true poses."""
@@ -292,22 +288,16 @@ def test_a_robot_whose_driver_is_killed_while_it_maps_is_lost_until_its_scans_te
         return way_from(there.x, there.y, truths[-1]) > 0.1
 
     with ExitStack() as running:
-
-        def start(spec: NodeSpec) -> Program:
-            log = tmp_path / f"{spec.name}.log"
-            return running.enter_context(
-                Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package)
-            )
-
-        specs = graph_of(options, simulated_swarm(options), str(tmp_path))
-        programs = {spec.executable: (spec, start(spec)) for spec in specs}
+        programs = {
+            spec.executable: (spec, start_of(running, tmp_path, spec)) for spec in simulated_graph(tmp_path)
+        }
         ros.until(lambda: len(goals) > 1, patience_s=240.0)
         since = len(truths)
         ros.until(lambda: has_driven(since), patience_s=240.0)
         spec, driver = programs["pushbot_driver_node"]
         driver.end(signal.SIGKILL)
         known = len(fixes)
-        start(spec)
+        start_of(running, tmp_path, spec)
         ros.until(lambda: counted("odometry_restarts"), patience_s=240.0)
         stops, cells = counted("stops"), maps[-1].data
         # one scan never tells where it is, and more of them may not in so small a map

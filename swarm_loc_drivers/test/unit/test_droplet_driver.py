@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
+from droplet_rig import IDEAL, LINK, SECOND, TRIANGLE, read_by, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,9 +47,7 @@ from swarm_loc_drivers.sim.droplet.world import (
     DropletWorld,
 )
 from swarm_loc_estimator.cli import calibrate_ir
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -201,13 +199,6 @@ def test_an_endless_line_does_not_fill_the_memory() -> None:
     assert event.reason == BROKEN
 
 
-def test_lines_to_type() -> None:
-    assert console.typed(console.move_steps(0, 50)).hex(" ").upper() == (
-        "6D 6F 76 65 5F 73 74 65 70 73 20 30 20 35 30"
-    )
-    assert console.for_robot(0x29, console.set_power(256)) == "tgt_cmd 0029 set_ir 256"
-
-
 @pytest.mark.parametrize("line", ["", "x" * 64, "get_id\r", "get\nid", "get_id\x00", "gét_id"])
 def test_what_no_line_may_hold_is_refused(line: str) -> None:
     with pytest.raises(console.CommandError, match="1 to 63 printable"):
@@ -273,21 +264,13 @@ def exchange(world: DropletWorld, emitter: int = 0, power: int = FULL_POWER) -> 
     return found
 
 
-def model(world: DropletWorld, receiver: int, emitter: int) -> FloatArray:
-    """What a board reads (modes, n, n) without noise, sensors by emitters."""
-    seen = se2.between(world.poses[receiver], world.poses[emitter])
-    pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
-    readings: FloatArray = expected_brightness(QUIET, pose)[0]
-    return readings
-
-
 @pytest.mark.parametrize(("power", "mode"), [(FULL_POWER, 0), (NEAR_POWER, 1)])
 def test_sensors_read_what_the_board_makes_of_the_poses(power: int, mode: int) -> None:
     world = world_of()
     found = exchange(world, power=power)
     assert set(found) == {1, 2}
     for robot, readings in found.items():
-        exact = np.clip(np.rint(model(world, robot, 0)[mode].T), 0.0, 255.0)
+        exact = np.clip(np.rint(read_by(world, robot, 0)[mode].T), 0.0, 255.0)
         assert (readings == exact).all()
 
 
@@ -300,7 +283,7 @@ def test_power_in_between_shines_in_between() -> None:
 
 def test_elements_differ_by_their_gains() -> None:
     world = world_of(np.array([[0.0, 0.0, 0.0], [0.18, 0.0, 0.5]]), replace(IDEAL, gain_sigma=0.1))
-    bright = model(world, 1, 0)[0].T
+    bright = read_by(world, 1, 0)[0].T
     shares = exchange(world)[1] / np.where(bright > 8.0, bright, np.nan)
     gains = world.gains[1, 0][:, None] * world.gains[0, 1][None]
     shown = ~np.isnan(shares)
@@ -315,7 +298,7 @@ def test_counts_end_where_the_converter_does_and_ambient_light_is_taken_off() ->
     readings = exchange(world)[1]
     assert 247 <= readings.max() <= 255
     assert (readings == 255).sum() < (readings > 245).sum()
-    dim = model(world, 1, 0)[0].T < 0.5
+    dim = read_by(world, 1, 0)[0].T < 0.5
     assert np.abs(readings[dim]).max() <= 6
     assert abs(readings[dim].mean()) < 2.0
 

@@ -93,17 +93,6 @@ def test_a_move_lasts_its_steps_and_another_one_is_acknowledged_but_ignored(robo
     assert moved == pytest.approx(ahead, abs=2 * STEP_NS * 1e-9 * gait.velocity[0])
 
 
-def test_stopping_makes_room_for_the_next_move(robots: Robots) -> None:
-    gait = nominal_gait(7)
-    robots.type(0, "move_steps 0 1000")
-    robots.type(0, "stop_walk")
-    robots.type(0, "move_steps 7 10")
-    robots.run(round(20 * gait.step_s * 1e9))
-    moved = robots.world.poses[0] - TRIANGLE[0]
-    assert moved[:2] == pytest.approx([0.0, 0.0])
-    assert moved[2] == pytest.approx(10 * gait.turn, abs=2 * STEP_NS * 1e-9 * gait.velocity[2])
-
-
 def test_a_command_reaches_one_robot_or_all_by_infrared(robots: Robots) -> None:
     robots.type(0, "tgt_cmd 6B6F get_id")
     robots.run(message_ns(6) + HANDLING_NS + STEP_NS)
@@ -168,11 +157,3 @@ def test_whatever_was_typed_it_goes_on_answering(noise: bytes) -> None:
     firmware.stream()
     firmware.receive(b"\r\b\r")
     assert firmware.receive(b"get_id\r").endswith(b"get_id\r\nMy ID is: 0029\r\n")
-
-
-def test_the_settings_are_printed_and_read(robots: Robots) -> None:
-    printed = robots.type(0, "print_motor_settings")
-    lines = [said.event for said in ConsoleParser().feed(printed.encode(), 0)]
-    assert len(lines) == 1 + 1 + 8 + 1 + 8
-    assert lines[2] == (0, SimulatedDroplet.trims[0])
-    assert lines[-1] == (7, SimulatedDroplet.lengths[7])

@@ -109,29 +109,6 @@ def test_time_that_jumps_back_leaves_the_robot_where_it_is() -> None:
     assert ending_at(motion, -50.0) == pytest.approx(there)
 
 
-def test_what_was_perhaps_not_heard_is_uncertain_as_a_whole() -> None:
-    sure, unsure = CommandedMotion(NOISE), CommandedMotion(NOISE)
-    sure.begin(START_NS, AHEAD, 100)
-    unsure.begin(START_NS, AHEAD, 100, doubt=0.09)
-    states = [motion.state(START_NS + 60 * SECOND) for motion in (sure, unsure)]
-    way = 100 * AHEAD.forward
-    assert np.diag(states[1].covariance - states[0].covariance) == pytest.approx([0.09 * way**2, 0.0, 0.0])
-    unsure.stop(START_NS + 61 * SECOND)
-    after = unsure.state(START_NS + 70 * SECOND)
-    assert after.covariance == pytest.approx(states[1].covariance)
-
-
-def test_a_stop_that_was_perhaps_not_heard_leaves_the_rest_of_the_way_in_doubt() -> None:
-    sure, unsure = CommandedMotion(NOISE), CommandedMotion(NOISE)
-    for motion, doubt in ((sure, 0.0), (unsure, 0.09)):
-        motion.begin(START_NS, TURN, 100)
-        motion.stop(START_NS + round(20 * TURN.step_s * SECOND), doubt)
-    one, other = (motion.state(START_NS + 60 * SECOND) for motion in (sure, unsure))
-    assert other.pose == pytest.approx(one.pose)
-    rest = 80 * TURN.turn
-    assert np.diag(other.covariance - one.covariance) == pytest.approx([0.0, 0.0, 0.09 * rest**2])
-
-
 def hold(console: ConsoleTalk, talk: Talk[None]) -> None:
     """Have a talk with a robot that echoes at once."""
     while True:

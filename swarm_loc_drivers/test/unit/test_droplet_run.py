@@ -48,16 +48,6 @@ def test_every_other_robot_wanders_around_its_place(run: DropletRun) -> None:
     assert away.max() < 0.04
 
 
-def test_odometry_goes_wrong_as_described(run: DropletRun) -> None:
-    errors = []
-    for robot in range(1, SETTINGS.robots, 2):
-        rows = run.odometry[run.odometry["robot"] == robot]
-        told = rows["pose"][np.argmax(rows["stamp_ns"])]
-        true = se2.between(run.truth.poses[0, robot], run.truth.poses[-1, robot])
-        errors.append(np.abs(told - true)[:2].max())
-    assert 1e-5 < max(errors) < 0.02
-
-
 def test_matrices_show_the_robots_where_they_were(run: DropletRun) -> None:
     boards = [robot.ir for robot in run.swarm.robots]
     index_of = {board.id: index for index, board in enumerate(boards) if board is not None}

@@ -10,7 +10,6 @@ from droplet_rig import (
     IDEAL,
     IDS,
     LINK,
-    POWERS,
     SECOND,
     START_NS,
     TRIANGLE,
@@ -18,6 +17,7 @@ from droplet_rig import (
     asking,
     print_2014,
     print_2016,
+    read_by,
     taking_turns,
     world_of,
 )
@@ -28,26 +28,13 @@ from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors, SimulatedDroplet
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.swarm.ir_board import load_ir_platform
-
-PLATFORM = load_ir_platform("droplet")
-
-
-def model(lab: Lab, receiver: int, transmitter: int) -> FloatArray:
-    """What a robot reads of another one (modes, n, n), sensors by emitters."""
-    seen = se2.between(lab.world.poses[receiver], lab.world.poses[transmitter])
-    pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
-    readings: FloatArray = np.clip(expected_brightness(PLATFORM, pose)[0], 0.0, 255.0)
-    return readings
 
 
 def assert_shows(lab: Lab, one: Brightness, receiver: int) -> None:
     """The matrix is what the receiver must have read."""
-    exact = model(lab, receiver, IDS.index(one.transmitter))[one.power]
-    assert np.abs(one.readings - exact).max() <= 0.5 + 1e-6
+    exact = read_by(lab.world, receiver, IDS.index(one.transmitter))[one.power]
+    assert np.abs(one.readings - np.clip(exact, 0.0, 255.0)).max() <= 0.5 + 1e-6
 
 
 def test_a_partner_is_asked_at_both_powers() -> None:
@@ -207,13 +194,8 @@ def test_turns_with_one_power_use_their_second_half() -> None:
     assert lab.cables[0].counts["half_exchanges"] == len(lab.found[0]) == pytest.approx(6, abs=2)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> None:
-    lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
-    (cable,) = lab.cables
-    firmware = cable.firmware
-    cable.firmware = BadWire(firmware, 0.002, seed)
-    assert isinstance(firmware, DropletFirmware)
+def noted_commands(firmware: DropletFirmware) -> list[str]:
+    """The lines that are executed from now on."""
     executed: list[str] = []
     execute = firmware._execute
 
@@ -222,6 +204,17 @@ def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> N
         execute(line)
 
     firmware._execute = noting  # type: ignore[method-assign]
+    return executed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> None:
+    lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
+    (cable,) = lab.cables
+    firmware = cable.firmware
+    cable.firmware = BadWire(firmware, 0.002, seed)
+    assert isinstance(firmware, DropletFirmware)
+    executed = noted_commands(firmware)
     lab.connected()
     lab.control = lambda: cable.set_velocity((0.01, 0.0, 0.0))
     lab.run(30.0)
@@ -237,14 +230,9 @@ def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> N
 def test_what_a_deaf_robot_kept_of_a_line_is_not_executed_with_the_next_one() -> None:
     lab = Lab(world_of(), asking()).connected()
     (cable,) = lab.cables
-    executed: list[str] = []
     firmware = cable.firmware
     assert isinstance(firmware, DropletFirmware)
-
-    def noting(line: str) -> None:
-        executed.append(line)
-
-    firmware._execute = noting  # type: ignore[method-assign]
+    executed = noted_commands(firmware)
     deaf_until_ns = lab.world.now_ns + SECOND // 2
     firmware._body.deaf_until_ns = lambda: deaf_until_ns  # type: ignore[method-assign]
     cable.set_velocity((0.01, 0.0, 0.0))
@@ -308,7 +296,6 @@ def test_the_errors_of_the_named_worlds_leave_most_exchanges_whole() -> None:
     counts = lab.cables[0].counts
     assert counts["exchanges"] > 4 * counts["half_exchanges"]
     assert lab.found[0][0].stamp_ns > START_NS
-    assert len(POWERS) == 2
 
 
 def test_a_droplet_that_has_nothing_to_do_and_says_nothing_is_found_out() -> None:

@@ -112,12 +112,6 @@ def test_a_request_sets_the_speeds_and_is_framed_by_them() -> None:
     assert serial_session.image_request(0, 0, 40, 40).data.hex(" ").upper() == "BB B7 BB 00"
 
 
-def test_readings_are_little_endian() -> None:
-    data = bytes.fromhex("FF7F0080") + struct.pack("<8H", *range(100, 108))
-    left, right, proximity = serial_session.decode_readings(data)
-    assert (left, right, proximity.tolist()) == (32767, -32768, list(range(100, 108)))
-
-
 def test_a_picture_of_another_size_or_mode_is_refused() -> None:
     assert serial_session.decode_image(bytes([1, 2, 1]) + b"abcd", 2, 1) == b"abcd"
     assert serial_session.decode_image(bytes([0, 2, 1]) + b"abcd", 2, 1) is None

@@ -169,11 +169,8 @@ def test_images_over_wifi_are_stamped_when_the_firmware_fetched_them() -> None:
     assert np.abs(ages_ns).max() <= EXPOSURE_PERIOD_NS
 
 
-STALL_S = (0.2, 0.4, 0.6, 0.8, 1.0)
-
-
 @pytest.mark.parametrize("mode", ["waits", "is_under_way", "is_queued"])
-@pytest.mark.parametrize("stall_s", STALL_S)
+@pytest.mark.parametrize("stall_s", [0.2, 0.4, 0.6, 0.8, 1.0])
 def test_stalls_of_the_stream_cost_no_odometry(stall_s: float, mode: str) -> None:
     """A minute's drive in which the way to the computer is blocked every two to three seconds."""
     wire = Wire(replace(WIFI, camera=stall_s in {0.4, 0.8}, reading_rate=20.0))

@@ -100,11 +100,6 @@ def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
     assert not wire.firmware.board.is_streaming
 
 
-def deaf_to_stops(wire: PushbotWire) -> None:
-    """Let a robot ignore duty cycles."""
-    wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[assignment, method-assign]
-
-
 @pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
 @pytest.mark.parametrize("ends", [False, True])
 def test_a_stop_that_the_firmware_loses_is_repeated_until_the_wheels_stand(
@@ -136,7 +131,7 @@ def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
     driver = PushbotDriver(pushbot_params(), PushbotListeners(print, print), lambda: 0)
     wire.velocities = (30, 30)
     wire.run(0.5)
-    deaf_to_stops(wire)
+    wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[assignment, method-assign]
     wire.velocities = (0, 0)
     wire.run(0.9)
     assert wire.counts["ignored_stops"] == 0

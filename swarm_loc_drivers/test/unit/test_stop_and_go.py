@@ -201,18 +201,6 @@ def test_odometry_that_begins_anew_makes_a_first_scan(shift: float, pause_s: flo
     assert robot.motion.restarts == 1
 
 
-def test_after_a_restart_it_looks_from_another_place_while_it_gets_no_goal() -> None:
-    robot = looked_around()
-    robot.odometry[0] += 1.0
-    robot.until_still()
-    before, place = robot.turned, robot.pose[:2].copy()
-    while not robot.step():
-        pass
-    robot.until_still()
-    assert math.dist(robot.pose[:2], place) == pytest.approx(0.4, abs=0.01)
-    assert robot.turned - before == pytest.approx(SCAN_TURN, abs=0.03)
-
-
 def test_after_a_restart_it_turns_to_where_it_is_farthest_if_something_is_ahead() -> None:
     robot, open_heading = looked_around(), 1.7
     robot.odometry[0] += 1.0

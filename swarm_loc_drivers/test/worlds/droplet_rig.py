@@ -22,7 +22,9 @@ from swarm_loc_drivers.sim.droplet.world import (
     DropletWorldSettings,
     SimulatedDroplet,
 )
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 SECOND = 1_000_000_000
@@ -48,6 +50,14 @@ def world_of(
     return DropletWorld(ids[: len(start)], start, settings)
 
 
+def read_by(world: DropletWorld, receiver: int, emitter: int) -> FloatArray:
+    """What a board reads of another one without noise (modes, n, n), sensors by emitters."""
+    seen = se2.between(world.poses[receiver], world.poses[emitter])
+    pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
+    readings: FloatArray = expected_brightness(QUIET, pose)[0]
+    return readings
+
+
 def asking(
     *partners: int, period_s: float = 0.0, retries: int = 5, powers: Sequence[int] = POWERS
 ) -> PollingSettings:
@@ -58,11 +68,6 @@ def asking(
 def taking_turns(turn: int, turns: int = 3, powers: Sequence[int] = POWERS) -> TdmaSettings:
     """Emit in this turn."""
     return TdmaSettings(turn, turns, 1.0, tuple(powers), ())
-
-
-def session_settings(exchanges: PollingSettings | TdmaSettings) -> SessionSettings:
-    """A whole Droplet."""
-    return SessionSettings(DROPLET, ELEMENTS, 0.3, exchanges)
 
 
 class Lab:
@@ -81,7 +86,7 @@ class Lab:
         self.world = world
         self.found: list[list[Brightness]] = [[] for _ in exchanges]
         self.cables = [
-            Cable(world, robot, session_settings(one), NOISE, self.found[robot].append)
+            Cable(world, robot, SessionSettings(DROPLET, ELEMENTS, 0.3, one), NOISE, self.found[robot].append)
             for robot, one in enumerate(exchanges)
         ]
         loose = [

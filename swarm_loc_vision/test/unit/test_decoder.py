@@ -20,7 +20,6 @@ from swarm_loc_vision.markers.decoder import (
 from swarm_loc_vision.markers.families import Family, draw_marker, families, family_named
 
 BCH = family_named("artoolkit_bch_thin")
-rotated = BCH.layout.rotated
 
 
 def distances(word: np.uint64, words: np.ndarray[tuple[int], np.dtype[np.uint64]]) -> list[int]:
@@ -34,27 +33,9 @@ def test_bch_words_are_nine_bits_apart_in_one_orientation() -> None:
         assert sorted(apart)[:2] == [0, 9]
 
 
-def test_bch_ids_come_close_when_turned() -> None:
-    turned = np.concatenate([rotated(BCH.words, quarters) for quarters in (1, 2, 3)])
-    closest = [min(distances(word, turned)) for word in BCH.words[3000:3100]]
-    assert min(closest) == 2
-    pair = np.concatenate([rotated(BCH.words[1550:1551], quarters) for quarters in (1, 2, 3)])
-    assert min(distances(BCH.words[3080], pair)) <= 4  # who takes the first id that is near reads 1550
-
-
 def test_bch_words_hold_their_id_above_the_mask() -> None:
     ids = ((BCH.words ^ np.uint64(0x8F80B8750)) >> np.uint64(24)).astype(int)
     assert (ids == np.arange(4096)).all()
-
-
-def test_turning_four_quarters_changes_nothing() -> None:
-    words = BCH.words[:50]
-    assert (rotated(rotated(words, 1), 3) == words).all()
-    assert (rotated(rotated(words, 2), 2) == words).all()
-    assert (
-        rotated(words, 1)
-        == BCH.layout.packed(np.rot90(np.stack([BCH.pattern(i) for i in range(50)]), 1, (1, 2)))
-    ).all()
 
 
 def dictionary_of_opencv(name: str) -> cv2.aruco.Dictionary:

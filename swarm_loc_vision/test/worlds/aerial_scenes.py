@@ -5,7 +5,6 @@ import math
 import cv2
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.ground_control import ControlPoints, GroundCamera
 from swarm_loc_vision.common.camera import Camera
 
@@ -47,8 +46,3 @@ def floor_points(ground: GroundCamera, rng: np.random.Generator, count: int) -> 
     flat = ground.places(shares * [width, height], 0.0)
     places = np.concatenate([flat, np.zeros((count, 1))], axis=1)
     return ControlPoints([f"p{k}" for k in range(count)], places, ground.pixels(places))
-
-
-def spread(values: FloatArray) -> FloatArray:
-    """(n, n) sample covariance of rows (N, n) about zero."""
-    return np.asarray(values.T @ values / len(values))
