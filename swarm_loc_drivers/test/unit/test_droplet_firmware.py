@@ -157,3 +157,11 @@ def test_whatever_was_typed_it_goes_on_answering(noise: bytes) -> None:
     firmware.stream()
     firmware.receive(b"\r\b\r")
     assert firmware.receive(b"get_id\r").endswith(b"get_id\r\nMy ID is: 0029\r\n")
+
+
+def test_the_settings_are_printed_and_read(robots: Robots) -> None:
+    printed = robots.type(0, "print_motor_settings")
+    lines = [said.event for said in ConsoleParser().feed(printed.encode(), 0)]
+    assert len(lines) == 1 + 1 + 8 + 1 + 8
+    assert lines[2] == (0, SimulatedDroplet.trims[0])
+    assert lines[-1] == (7, SimulatedDroplet.lengths[7])
