@@ -52,8 +52,5 @@ def test_a_tracker_names_another_type_of_its_events(ros: Ros, published: type, s
     diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
     ros.add(EventTrackerNode(namespace="pushbot1"))
     ros.until(lambda: diagnostics and diagnostics[-1].status[0].message != "tracking")
-    assert (
-        diagnostics[-1]
-        .status[0]
-        .message.startswith(f"no messages received on /pushbot1/events{said} for 5 s")
-    )
+    (status,) = diagnostics[-1].status
+    assert status.message.startswith(f"no messages received on /pushbot1/events{said} for 5 s")

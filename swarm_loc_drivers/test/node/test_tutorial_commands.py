@@ -36,6 +36,11 @@ def done(command: tuple[str, list[str]], name: str, status: int = 0) -> str:
     return ended.stdout
 
 
+def simulation_of(command: tuple[str, list[str]], folder: Path) -> Program:
+    package, arguments = command
+    return Program("simulate", folder / "log", {}, package=package, options=arguments)
+
+
 def all_have(status: int, poses: Poses) -> bool:
     return bool(poses) and all(one.status == status for one in poses[-1].robots)
 
@@ -56,9 +61,7 @@ def test_a_new_swarm_is_simulated_and_located(
     assert (tmp_path / "out" / "lab" / "markers.pdf").stat().st_size > 10_000
     swarm = load_swarm(tmp_path / "out" / "lab" / "swarm.yaml")
     poses: Poses = ros.listen(SwarmPoses, "swarm/poses")
-    package, arguments = page["simulate"]
-    program = {"package": package, "options": arguments}
-    with Program("simulate", tmp_path / "log", {}, **program) as simulation:  # type: ignore[arg-type]
+    with simulation_of(page["simulate"], tmp_path) as simulation:
         ros.until(lambda: all_have(SwarmPose.STATUS_TRACKED, poses), 200.0)
         # on a busy machine messages may really pause, which is no fault of the page
         wrong = [line for line in run("doctor", 1).splitlines() if line.startswith("- ")]
@@ -94,8 +97,6 @@ def test_robots_of_a_tutorial_are_located(
     assert list(page) == ["new", "simulate", "watch"]
     done(page["new"], "new")
     poses: Poses = ros.listen(SwarmPoses, "swarm/poses")
-    package, arguments = page["simulate"]
-    program = {"package": package, "options": arguments}
-    with Program("simulate", tmp_path / "log", {}, **program) as simulation:  # type: ignore[arg-type]
+    with simulation_of(page["simulate"], tmp_path) as simulation:
         ros.until(lambda: all_have(status, poses), 200.0)
         assert simulation.end(signal.SIGTERM) == 0

@@ -1,5 +1,6 @@
 """Bags of simulated swarms: written by the command, with images, and those of the repository."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,13 @@ def run() -> SimulatedRun:
     return simulate_eight(EightSettings(seed=3, duration_s=6.0))
 
 
+def of_topic(
+    messages: list[tuple[str, str, int, bytes]], name: str, decode: Callable[[bytes], Any]
+) -> list[tuple[int, Any]]:
+    """When the messages of a topic were recorded, and what they say."""
+    return [(log_ns, decode(data)) for topic, _, log_ns, data in messages if topic == name]
+
+
 def test_the_description_is_that_of_the_run(bag: Path, run: SimulatedRun) -> None:
     assert load_swarm(bag / "swarm.yaml") == run.swarm
 
@@ -55,20 +63,14 @@ def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(
             for topic in ("odom", "detections", "ground_truth")
         }
         messages = list(reader.messages())
-    odometry = [
-        (log_ns, decode_odometry(data)) for topic, _, log_ns, data in messages if topic == "epuck2/odom"
-    ]
+    odometry = of_topic(messages, "epuck2/odom", decode_odometry)
     rows = run.odometry[run.odometry["robot"] == 1]
     assert [log_ns for log_ns, _ in odometry] == rows["arrival_ns"].tolist()
     assert [one.stamp_ns for _, one in odometry] == rows["stamp_ns"].tolist()
     np.testing.assert_allclose([one.pose for _, one in odometry], rows["pose"], atol=1e-12)
     assert odometry[0][1].frame_id == "epuck2/odom"
     assert np.mean([one.twist[0] for _, one in odometry[1:]]) == pytest.approx(0.06, abs=0.003)
-    images = [
-        (log_ns, decode_detections(data))
-        for topic, _, log_ns, data in messages
-        if topic == "epuck2/detections"
-    ]
+    images = of_topic(messages, "epuck2/detections", decode_detections)
     frames = run.frames[run.frames["robot"] == 1]
     assert [log_ns for log_ns, _ in images] == frames["arrival_ns"].tolist()
     assert [one.stamp_ns for _, one in images] == frames["stamp_ns"].tolist()
@@ -139,11 +141,7 @@ def test_every_picture_comes_with_its_calibration_and_late(bag_image: Path) -> N
         "camera_info",
     }
     images, infos = (
-        [
-            (log_ns, store.deserialize_cdr(data, kind))
-            for topic, _, log_ns, data in messages
-            if topic == f"epuck2/{name}"
-        ]
+        of_topic(messages, f"epuck2/{name}", lambda data, kind=kind: store.deserialize_cdr(data, kind))  # type: ignore[misc]
         for name, kind in (("image_raw/compressed", COMPRESSED_IMAGE), ("camera_info", CAMERA_INFO))
     )
     assert [one.header for _, one in images] == [one.header for _, one in infos]

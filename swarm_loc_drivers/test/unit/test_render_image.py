@@ -218,13 +218,8 @@ def test_a_picture_shows_what_its_rays_meet(seed: int, model: CameraModel, tilt:
 def _beside(pose: FloatArray, distance: float, bearing: float, rng: np.random.Generator) -> FloatArray:
     """A pose in front of another one."""
     angle = pose[2] + bearing
-    return np.array(
-        [
-            pose[0] + distance * math.cos(angle),
-            pose[1] + distance * math.sin(angle),
-            rng.uniform(-math.pi, math.pi),
-        ]
-    )
+    x, y = pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+    return np.array([x, y, rng.uniform(-math.pi, math.pi)])
 
 
 def _rays(camera: RobotCamera, model: CameraModel, pose: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -312,9 +307,7 @@ def test_more_instants_than_asked_for_change_nothing_that_matters(
     turn: float, ahead: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    start = np.array(
-        [rng.uniform([-0.8, -0.4, -3], [0.8, 0.4, 3]), rng.uniform([-0.8, -0.4, -3], [0.8, 0.4, 3])]
-    )
+    start = rng.uniform([-0.8, -0.4, -3], [0.8, 0.4, 3], (2, 3))
     renderer, camera = Renderer(small_arena(2), SHARP), RobotCamera(0, SHARP, CAMERA)
     motion = np.array([[ahead, 0.0, turn], [0.5 * ahead, 0.0, -turn]])
 
@@ -404,10 +397,8 @@ def test_view(marker: tuple[float, float, float], *, seen: bool) -> None:
 
 
 def test_a_view_of_half_a_turn_sees_everything_in_front() -> None:
-    assert View(math.pi, 0.0, 2.0, math.pi).sees(np.array([[0.1, 1.0, 0.0], [-0.1, 1.0, 0.0]])).tolist() == [
-        True,
-        False,
-    ]
+    half = View(math.pi, 0.0, 2.0, math.pi)
+    assert half.sees(np.array([[0.1, 1.0, 0.0], [-0.1, 1.0, 0.0]])).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -477,24 +468,18 @@ def test_gross_errors_come_at_their_rate() -> None:
 
 
 def test_a_world_of_systematic_errors_differs_by_robot() -> None:
-    still = replace(
-        W2,
-        forward_sigma=0.0,
-        left_sigma=0.0,
-        flip_probability=0.0,
-        gross_probability=0.0,
-        exposure_early_s=0.0,
+    still = replace(W2, forward_sigma=0.0, left_sigma=0.0, flip_probability=0.0, gross_probability=0.0)
+    flat = replace(
+        still, map_position_sigma=0.0, face_position_sigma=0.0, turn_slip=0.0, exposure_early_s=0.0
     )
-    flat = replace(still, map_position_sigma=0.0, face_position_sigma=0.0, turn_slip=0.0)
     run = simulate_eight(EightSettings(duration_s=20.0, errors=flat))
     exact, robot, _ = exact_values(run)
     value = run.sightings["value"]
     scale = np.linalg.norm(value[:, :2], axis=1) / np.linalg.norm(exact[:, :2], axis=1)
     turned = np.arctan2(value[:, 1], value[:, 0]) - np.arctan2(exact[:, 1], exact[:, 0])
     scales = [scale[robot == k] for k in range(5)]
-    assert all(
-        np.ptp(one) < 0.02 for one in scales
-    )  # the camera's offset keeps it from being exactly constant
+    # the camera's offset keeps it from being exactly constant
+    assert all(np.ptp(one) < 0.02 for one in scales)
     assert 0.01 < np.std([one.mean() for one in scales]) < 0.05
     yaws = [turned[robot == k].mean() for k in range(5)]
     assert math.radians(0.6) < np.std(yaws) < math.radians(4.0)

@@ -5,32 +5,34 @@ import math
 import numpy as np
 import pytest
 
-from bench.scenarios.lived_run import drive
-from swarm_loc_drivers.sim.differential_drive import (
-    Controller,
-    Drive,
-    LastingNoise,
-    integrate,
-    twist_of,
-    wheel_paths,
-)
+from bench.scenarios.lived_run import Driven, drive
+from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, integrate, twist_of, wheel_paths
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import Lemniscate
+from swarm_loc_estimator.common.arrays import FloatArray
 
 SEPARATION = 0.053
 IDEAL = Drive(SEPARATION, wheel_noise=0.0)
+START = np.zeros((1, 3))
 
 
-def constant(speed: float, turn_rate: float, robots: int) -> Controller:
-    return lambda _step, _pose: (np.full(robots, speed), np.full(robots, turn_rate))
+def driven_at(
+    speed: float,
+    turn_rate: float,
+    steps: int,
+    model: Drive = IDEAL,
+    start: FloatArray = START,
+    step_s: float = 0.01,
+) -> Driven:
+    """Robots that are commanded a constant twist."""
+    speeds, turn_rates = np.full(len(start), speed), np.full(len(start), turn_rate)
+    rng = np.random.default_rng(1)
+    return drive(rng, start, lambda *_: (speeds, turn_rates), model, step_s=step_s, steps=steps)
 
 
 @pytest.mark.parametrize(("speed", "turn_rate"), [(0.06, 0.3), (0.1, -1.2), (0.0, 0.8), (-0.05, 0.4)])
 def test_an_ideal_robot_drives_the_arc_of_its_twist(speed: float, turn_rate: float) -> None:
-    start = np.array([[0.4, -0.2, 2.0]])
-    driven = drive(
-        np.random.default_rng(0), start, constant(speed, turn_rate, 1), IDEAL, step_s=0.01, steps=700
-    )
+    driven = driven_at(speed, turn_rate, 700, start=np.array([[0.4, -0.2, 2.0]]))
     heading = 2.0 + turn_rate * 7.0
     radius = speed / turn_rate
     expected = [
@@ -42,9 +44,7 @@ def test_an_ideal_robot_drives_the_arc_of_its_twist(speed: float, turn_rate: flo
 
 
 def test_a_straight_line_is_as_long_as_speed_times_time() -> None:
-    driven = drive(
-        np.random.default_rng(0), np.zeros((1, 3)), constant(0.06, 0.0, 1), IDEAL, step_s=0.01, steps=500
-    )
+    driven = driven_at(0.06, 0.0, 500)
     np.testing.assert_allclose(driven.truth[-1, 0], [0.3, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(driven.reported[-1, 0], [0.3, 0.0, 0.0], atol=1e-12)
 
@@ -58,15 +58,7 @@ def test_odometry_integrates_to_the_true_arc_but_for_its_midpoint_rule() -> None
 
 def test_wheel_noise_grows_with_the_path_of_each_wheel() -> None:
     robots, noise, speed, turn_rate = 20000, 2e-5, 0.06, 0.8
-    model = Drive(SEPARATION, noise)
-    driven = drive(
-        np.random.default_rng(1),
-        np.zeros((robots, 3)),
-        constant(speed, turn_rate, robots),
-        model,
-        step_s=0.01,
-        steps=10,
-    )
+    driven = driven_at(speed, turn_rate, 10, Drive(SEPARATION, noise), np.zeros((robots, 3)))
     right, left = 0.1 * (speed + 0.5 * SEPARATION * turn_rate), 0.1 * (speed - 0.5 * SEPARATION * turn_rate)
     heading_variance = noise * (right + left) / SEPARATION**2
     turned = driven.truth[-1, :, 2]
@@ -93,14 +85,7 @@ def test_lasting_noise_has_the_variance_of_white_noise_over_longer_times() -> No
 
 
 def test_slip_loses_its_share_of_a_turn_and_odometry_does_not_know() -> None:
-    driven = drive(
-        np.random.default_rng(0),
-        np.zeros((1, 3)),
-        constant(0.0, 1.0, 1),
-        Drive(SEPARATION, 0.0, turn_slip=0.05),
-        step_s=0.01,
-        steps=100,
-    )
+    driven = driven_at(0.0, 1.0, 100, Drive(SEPARATION, 0.0, turn_slip=0.05))
     assert driven.truth[-1, 0, 2] == pytest.approx(0.95)
     assert driven.reported[-1, 0, 2] == pytest.approx(1.0)
 
@@ -123,9 +108,7 @@ def test_the_eight_has_the_papers_length_and_curvature() -> None:
 
 
 def test_between_two_stamps_a_robot_keeps_its_twist() -> None:
-    driven = drive(
-        np.random.default_rng(0), np.zeros((1, 3)), constant(0.1, 2.0, 1), IDEAL, step_s=0.5, steps=4
-    )
+    driven = driven_at(0.1, 2.0, 4, step_s=0.5)
     track = Trajectories(np.arange(5, dtype=np.int64) * 500_000_000, driven.truth)
     pose = track.at(0, np.array([730_000_000]))[0]
     np.testing.assert_allclose(pose, [0.05 * math.sin(1.46), 0.05 * (1 - math.cos(1.46)), 1.46], atol=1e-12)
