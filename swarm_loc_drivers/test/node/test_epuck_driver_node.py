@@ -24,7 +24,6 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.poses import planar_pose
 
 
@@ -56,7 +55,7 @@ class Controller:
         self.velocity = (0.0, 0.0)
         self.ros.until(lambda: not any(is_moving(message) for message in self.odometry[-3:]))
 
-    def _until_gone(self, start: FloatArray, amount: float, *, turning: bool) -> None:
+    def _until_gone(self, start: tuple[float, float, float], amount: float, *, turning: bool) -> None:
         def gone() -> float:
             step = se2.between(start, planar_pose(self.odometry[-1].pose.pose))
             return abs(float(step[2])) if turning else math.hypot(step[0], step[1])

@@ -23,7 +23,7 @@ from swarm_loc_drivers.sim.link_host import FirmwareHost
 AHEAD = (0.02, 0.0, 0.0)
 EACH = pytest.mark.parametrize("protocol", PROTOCOLS)
 CUT = "the link is cut"
-Story = Iterator[Callable[[], bool]]
+Story = Iterator[Callable[[], object]]
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])
@@ -171,7 +171,7 @@ class Played(Run):
         self.is_cut = False
         super().__init__(protocol, self._watch)
         self._story = story(self)
-        self._condition = next(self._story)
+        self._condition: Callable[[], object] = next(self._story)
 
     def _watch(self) -> None:
         assert self.now_s < 160.0, (self.driver.trouble, self.driver.counts)
