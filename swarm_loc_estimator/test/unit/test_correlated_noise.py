@@ -373,12 +373,6 @@ def test_pictures_that_repeat_their_errors_mislead_less() -> None:
     assert np.median(independent) > 3.0 * np.median(told)
 
 
-def test_a_robot_that_stands_learns_little_from_more_pictures_() -> None:
-    world = simulate(STANDING, 400)
-    sigma = np.sqrt([np.trace(one.covariances[0][:2, :2]) for one in run(world)[1]])
-    assert sigma[-1] > 0.8 * sigma[8]  # with independent errors it is half
-
-
 def test_robots_that_drive_on_are_as_certain_as_the_filter_is() -> None:
     world = simulate(replace(STANDING, standing=(), speed=0.4), 401)
     state = run(world)[0]._timeline.state

@@ -79,25 +79,15 @@ def test_no_fix_makes_a_pose_surer_than_its_systematic_error(
     assert (left < 1.001 * ratio).all()
 
 
-def test_a_surer_fix_gives_its_covariance_and_another_is_ignored() -> None:
-    value = np.array([0.3, -0.2, 0.1])
-    pose, after = updated(1.0, 100.0 * NOISE, NOISE, value)
-    np.testing.assert_allclose(pose, 0.99 * value, rtol=1e-6)
-    np.testing.assert_allclose(after, NOISE, rtol=1e-6)
-    pose, after = updated(1.0, 0.5 * NOISE, NOISE, value)
-    np.testing.assert_allclose(pose, 0.0, atol=1e-6)
-    np.testing.assert_allclose(after, 0.5 * NOISE, rtol=1e-6)
-
-
 def walker(**about: object) -> Swarm:
     robot = Robot("walker", camera=None, stands=True, random_walk=RandomWalk(1e-9, 1e-9))
     return Swarm((replace(robot, **about),))  # type: ignore[arg-type]
 
 
-def after_fixes(swarm: Swarm, poses: list[FloatArray]) -> list[Estimate]:
+def after_fixes(estimator: Estimator, poses: list[FloatArray], first: int = 0) -> list[Estimate]:
     """The estimate after each of the fixes of a robot, one a second."""
-    estimator, found = Estimator(swarm), []
-    for second, pose in enumerate(poses):
+    found = []
+    for second, pose in enumerate(poses, first):
         stamp_ns = T0 + second * SECOND
         give_fix(estimator, 0, stamp_ns, pose, NOISE, stamp_ns)
         found.append(estimator.tick(stamp_ns))
@@ -105,10 +95,10 @@ def after_fixes(swarm: Swarm, poses: list[FloatArray]) -> list[Estimate]:
 
 
 def test_fixes_that_share_their_errors_make_no_surer_than_one() -> None:
-    first, *_, last = after_fixes(walker(fix=FixModel(1.0)), [POSE] * 40)
+    first, *_, last = after_fixes(Estimator(walker(fix=FixModel(1.0))), [POSE] * 40)
     assert first.status[0] == Status.TRACKED
     np.testing.assert_allclose(last.covariances[0], NOISE, rtol=5e-3)  # and the floor
-    independent = after_fixes(walker(), [POSE] * 40)
+    independent = after_fixes(Estimator(walker()), [POSE] * 40)
     assert independent[0].status[0] != Status.TRACKED
     assert np.trace(independent[-1].covariances[0]) < 0.1 * np.trace(NOISE)
 
@@ -117,15 +107,24 @@ def test_fixes_that_share_their_errors_make_no_surer_than_one() -> None:
 def test_a_start_that_a_fix_contradicts_gives_way_to_it(off: tuple[float, float, float]) -> None:
     start = tuple((POSE + np.array(off)).tolist())
     swarm = walker(fix=FixModel(1.0), start=start, start_sigma=StartSigma(0.01, 0.01, 0.01))
-    (only,) = after_fixes(swarm, [POSE])
+    (only,) = after_fixes(Estimator(swarm), [POSE])
     np.testing.assert_allclose(only.poses[0], POSE, atol=1e-6)
 
 
-def test_a_robot_that_was_carried_away_is_found_by_the_third_fix() -> None:
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_robot_that_was_carried_away_is_named_at_once_and_found_by_the_third_fix(share: float) -> None:
     elsewhere = POSE + np.array([2.0, 1.0, 1.0])
-    found = after_fixes(walker(fix=FixModel(1.0)), [POSE] * 20 + [elsewhere] * 3)
-    assert [one.status[0] == Status.TRACKED for one in found[-4:]] == [True, False, False, True]
+    estimator, poses = Estimator(walker(fix=FixModel(share))), [POSE] * 20 + [elsewhere] * 8
+    found = after_fixes(estimator, poses[:21])
+    assert estimator.contradictions(T0 + 20 * SECOND)
+    found += after_fixes(estimator, poses[21:], 21)
+    tracked = [one.status[0] == Status.TRACKED for one in found]
+    assert tracked[19:23] == [True, False, False, share > 0.0]
+    assert tracked[-1]
+    for one, true in zip(found, poses, strict=True):
+        assert one.status[0] != Status.TRACKED or np.hypot(*(one.poses[0] - true)[:2]) < 0.05
     np.testing.assert_allclose(found[-1].poses[0], elsewhere, atol=1e-6)
+    assert {one.kind for one in estimator.contradictions(T0 + 27 * SECOND)} <= {Contradicted.DESCRIPTION}
 
 
 @pytest.mark.parametrize("bag", ["pushbot_one", "pushbots_two"])
@@ -166,12 +165,9 @@ def test_the_covariance_of_a_fix_is_that_of_the_mapper_and_never_smaller() -> No
 
 ROOT, NEIGHBOUR = 0, 1
 LIMITS = LossLimits(1.0, 0.3, 12, 10.0)
-WALKER = Swarm((Robot("root", camera=None, stands=True, random_walk=RandomWalk(1e-6, 1e-4)),))
 WALKING = RandomWalk(5e-6, 3e-2)
 IRS = [RobotIr(k + 1, DROPLET, "droplet") for k in range(5)]
 RING = 0.5 * np.pi * np.arange(-1, 4)
-NOISE_GATED_FIXES = np.diag(np.square([0.002, 0.002, 0.02]))
-HERE, THERE = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 1.3])
 
 
 def looked(state: SwarmState, second: int, observer: int, passed: bool) -> int:
@@ -222,23 +218,6 @@ def test_a_fix_that_is_wrong_is_forgiven_with_a_landmark_in_its_place() -> None:
     one.landmark[:] = 0
     assert assessed(state, one, passed=True) == -1
     assert not is_contradicted(state.arrays(), ROOT)
-
-
-def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found() -> None:
-    estimator = Estimator(WALKER, Settings())
-    told, named = [], []
-    for second in range(18):
-        stamp_ns = T0 + second * SECOND
-        true = HERE if second < 10 else THERE
-        give_fix(estimator, 0, stamp_ns, true, NOISE_GATED_FIXES, stamp_ns)
-        estimate = estimator.tick(stamp_ns)
-        right = bool(np.hypot(*(estimate.poses[0] - true)[:2]) < 0.05)
-        told.append((estimate.status[0] == Status.TRACKED, right))
-        named.append(bool(estimator.contradictions(stamp_ns)))
-    assert all(right for tracked, right in told if tracked)
-    assert told[9] == told[17] == (True, True)
-    assert named[10]
-    assert {one.kind for one in estimator.contradictions(T0 + 17 * SECOND)} <= {Contradicted.DESCRIPTION}
 
 
 @pytest.mark.parametrize("seed", range(3))

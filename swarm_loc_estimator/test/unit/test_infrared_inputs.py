@@ -9,7 +9,7 @@ from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions, no_solutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
@@ -212,18 +212,6 @@ def test_measured_exchanges_are_those_since_the_last_restart() -> None:
     assert converter.counters["infrared exchanges measured"] == 2
 
 
-def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:
-    """A reading cut at 100 counts would be taken for a far robot."""
-    far = heard(noise=0.0)[0]
-    limit = int(0.6 * far.readings.max())
-    cut, told = replace(far, readings=np.minimum(far.readings, limit)), with_column(saturation=limit)
-    converter, ignorant = BrightnessConverter(swarm_of()), BrightnessConverter(swarm_of())
-    measured = converter.take(told(rows_of(cut))).added
-    assert measured.value[0, 0] == pytest.approx(relative(0, 1)[0], abs=2e-3)
-    wrong = ignorant.take(rows_of(cut)).added
-    assert not wrong.size or abs(wrong.value[0, 0] - relative(0, 1)[0]) > 5e-3
-
-
 def test_where_readings_end_is_each_matrixs_own_and_in_any_order_the_same() -> None:
     far, near = heard(poses=CLOSE)[:2]
     limits = {one.power: int(0.7 * one.readings.max()) for one in (far, near)}
@@ -280,11 +268,3 @@ def test_a_second_pose_becomes_the_alternative_and_no_covariance_is_no_measureme
     assert (measured.size, measured.has_second.tolist()) == (1, [True])
     np.testing.assert_allclose(measured.second[0], [0.11, 2.0, -1.0])
     assert converter.drops == {"bad_covariance": 2}
-
-
-def test_only_what_changed_is_looked_at_again() -> None:
-    events = heard()
-    converter = BrightnessConverter(swarm_of())
-    assert converter.take(rows_of(*events)).added.size == 2
-    nothing = converter.take(select(rows_of(*events), slice(0)))
-    assert (nothing.added.size, nothing.withdrawn.size) == (0, 0)

@@ -1,7 +1,6 @@
 """The model of brightness: its values, slopes and cost, and the gains of elements."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +9,10 @@ from ir_world import droplet, droplet_matrix, nees, pair_of, pose_errors, random
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
 from swarm_loc_estimator.infrared.cost import (
-    MEASURED,
-    MISSING,
-    SATURATED,
     CostWorkspace,
     Pair,
     cost_of,
     new_cost_workspace,
-    reading_cost,
 )
 from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -39,11 +34,6 @@ def test_readings_are_not_those_of_the_printed_equations(part: str) -> None:
     assert np.median(error) > 5.0
 
 
-def test_robots_that_face_each_other_read_most_with_the_elements_between_them() -> None:
-    bright = expected_brightness(droplet(), [0.15, np.radians(30.0), np.radians(180.0)])[0, 0]
-    assert np.unravel_index(bright.argmax(), bright.shape) == (5, 5)
-
-
 @pytest.mark.parametrize("name", PACKAGED)
 def test_slopes_are_those_of_the_readings(name: str) -> None:
     platform = load_ir_platform(name)
@@ -57,17 +47,6 @@ def test_slopes_are_those_of_the_readings(name: str) -> None:
             2.0 * step
         )
         np.testing.assert_allclose(slopes[..., column], numeric, rtol=2e-4, atol=1e-3)
-
-
-def test_turning_both_robots_by_one_element_shifts_the_matrix() -> None:
-    platform, step = droplet(), np.radians(60.0)
-    pose = np.array([0.13, 0.4, -1.0])
-    # both bodies are turned by a step, so the elements' numbers go round once
-    before = expected_brightness(platform, pose)[0]
-    sensors = expected_brightness(platform, pose + np.array([0.0, step, step]))[0]
-    np.testing.assert_allclose(np.roll(before, -1, axis=1), sensors, rtol=1e-6)
-    emitters = expected_brightness(platform, pose + np.array([0.0, 0.0, -step]))[0]
-    np.testing.assert_allclose(np.roll(before, -1, axis=2), emitters, rtol=1e-6)
 
 
 def test_gains_multiply_readings_and_slopes() -> None:
@@ -88,63 +67,10 @@ def test_contact_and_coincidence_stay_finite() -> None:
     assert np.isfinite(slopes).all()
 
 
-PLATFORMS = {
-    "blocked": droplet(),
-    "never blocked": replace(droplet(), blocked_share=0.0),
-    "relative": replace(droplet(), relative_noise=0.1),
-    "systematic": replace(droplet(), relative_noise=0.05, curve_sigma=0.1),
-    "bright": load_ir_platform("droplet_2016"),
-}
-
-
-def one_by_one(
-    model: IrModel, pair: Pair, bright: FloatArray, slopes: FloatArray
-) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Cost, gradient (3,), Hessian (3, 3), tally (3,), systematic information (3, 3), by reading."""
-    total, gradient, tally = 0.0, np.zeros(3), np.array([0.0, -3.0, 0.0])
-    hessian, systematic = np.zeros((2, 3, 3))
-    for f in np.flatnonzero(pair.kinds != MISSING):
-        cost, pull, weight, sure, share, square = reading_cost(
-            model.errors, pair.kinds[f], pair.cut[f], pair.stable[f], bright[f]
-        )
-        both = np.outer(slopes[f], slopes[f])
-        total += cost
-        gradient += pull * slopes[f]
-        hessian += weight * both
-        systematic += share * weight * both
-        tally += [2.0 * cost * sure, sure and pair.kinds[f] == MEASURED, square]
-    return total, gradient, hessian, tally, systematic
-
-
 def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, CostWorkspace]:
     """By `cost_of`."""
     work = new_cost_workspace(model.amplitudes.shape[0], model.angles.size, False)
     return cost_of(model, pair, pose, work, work.gradients[0], work.hessians[0]), work
-
-
-@pytest.mark.parametrize("name", PLATFORMS)
-@pytest.mark.parametrize("away", [0.0, 0.3])
-def test_the_cost_is_the_sum_over_readings(name: str, away: float) -> None:
-    """Near the pose, and where many readings are outliers; with saturated, missing and blocked ones."""
-    platform, rng = PLATFORMS[name], np.random.default_rng(5)
-    model, gains = platform.model, rng.uniform(0.9, 1.1, (2, 6))
-    for pose in random_poses(20, 5, low=0.06, high=0.2):
-        readings = readings_of(platform, pose[None], 5)[0]
-        readings[rng.random(readings.shape) < 0.1] = 0.0
-        readings[rng.random(readings.shape) < 0.1] = math.nan
-        pair = pair_of(model, readings, 0.6 * float(np.nanmax(readings)), gains)
-        assert {MISSING, MEASURED, SATURATED} == set(pair.kinds.tolist())
-        at = pose + away * np.array([0.03, 1.0, -1.0])
-        bright, slopes = expected_with_slopes(platform, at)
-        factor = np.outer(*gains)
-        wanted = one_by_one(
-            model, pair, (factor * bright[0]).ravel(), (factor[..., None] * slopes[0]).reshape(-1, 3)
-        )
-        cost, work = costs_at(model, pair, at)
-        hessian = np.tril(work.hessians[0]) + np.tril(work.hessians[0], -1).T
-        found = (cost, work.gradients[0], hessian, work.tally, work.systematic)
-        for one, other in zip(map(np.asarray, found), map(np.asarray, wanted), strict=True):
-            np.testing.assert_allclose(one, other, atol=1e-9 * max(float(np.abs(other).max()), 1.0))
 
 
 def test_what_a_dead_element_reads_does_not_count() -> None:

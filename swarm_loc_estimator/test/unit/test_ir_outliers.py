@@ -28,15 +28,22 @@ def with_faults(poses: FloatArray, seed: int) -> FloatArray:
     return np.minimum(readings, BOARD.saturation)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(seed: int) -> None:
-    poses = random_poses(600, seed, low=0.06, high=0.18)
+@pytest.mark.parametrize(
+    ("seed", "low", "high", "beyond"),
+    [(1, 0.06, 0.18, 0.03), (2, 0.06, 0.18, 0.03), (3, 0.06, 0.18, 0.03), (5, 0.2, 0.3, 0.05)],
+)
+def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(
+    seed: int, low: float, high: float, beyond: float
+) -> None:
+    """Of faint robots bearing or heading is often another one, and covariances say so."""
+    poses = random_poses(600, seed, low=low, high=high)
     solutions = ESTIMATOR.solve(with_faults(poses, seed))
     found = solutions.outcomes == IrOutcome.FOUND
-    assert np.mean(found) > 0.85
     errors = pose_errors(solutions.poses[found], poses[found])
-    assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.03
-    assert np.all(np.median(np.abs(errors), axis=0) < [0.01, np.radians(5.0), np.radians(10.0)])
+    assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < beyond
+    if high < 0.2:
+        assert np.mean(found) > 0.85
+        assert np.all(np.median(np.abs(errors), axis=0) < [0.01, np.radians(5.0), np.radians(10.0)])
 
 
 def test_covariances_say_of_the_same_direction_at_another_range() -> None:
@@ -56,15 +63,6 @@ def test_noise_alone_is_no_robot() -> None:
     noise = BOARD.noise * np.random.default_rng(4).standard_normal((500, 1, 6, 6))
     outcomes = ESTIMATOR.solve(noise).outcomes
     assert np.mean(outcomes == IrOutcome.FOUND) < 0.01
-
-
-def test_covariances_say_of_other_poses_that_are_likely() -> None:
-    """Faint robots, of which bearing or heading is often another one."""
-    poses = random_poses(600, 5, low=0.2, high=0.3)
-    solutions = ESTIMATOR.solve(with_faults(poses, 5))
-    found = solutions.outcomes == IrOutcome.FOUND
-    errors = pose_errors(solutions.poses[found], poses[found])
-    assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.05
 
 
 @pytest.mark.parametrize("seed", range(4))

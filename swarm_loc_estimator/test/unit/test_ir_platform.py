@@ -11,9 +11,7 @@ from ir_world import ANGLES, droplet, emitter_20, far_21, sensor_19
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import (
     amplitude_at,
-    amplitudes_at,
     curve_at,
-    curves_at,
     distance_at,
 )
 from swarm_loc_estimator.swarm.ir_board import (
@@ -45,11 +43,6 @@ def test_the_droplets_curves_are_those_of_the_paper() -> None:
     for r in np.linspace(0.035, 0.3, 50):
         assert amplitude_at(platform.model.amplitudes[0], r)[0] == pytest.approx(float(far_21(r)), rel=1e-12)
     np.testing.assert_allclose(platform.angles, ANGLES, atol=1e-8)
-
-
-def test_the_emitters_curve_has_the_errata_s_values() -> None:
-    angles = np.array([0.0, 0.5])
-    np.testing.assert_allclose(values(droplet().emitter, angles)[:, 0], [0.9375, 1.0], atol=1e-7)
 
 
 def test_slopes_are_those_of_the_values_and_one_sided_at_the_kink() -> None:
@@ -92,15 +85,6 @@ def test_the_inverse_amplitude_gives_the_distance_back(mode: int) -> None:
     back = [distance_at(law, one) for one in bright]
     np.testing.assert_allclose(back, distances, atol=1e-12)
     assert distance_at(law, -1.0) == np.inf
-
-
-def test_the_printed_inverse_is_rounded() -> None:
-    """Eq. (22) has 118 for the root of 14000: up to 0.07 cm."""
-    bright = np.linspace(10.0, 250.0, 50)
-    printed = 0.01 * (118.0 / np.sqrt(bright + 1.0) + 3.0)
-    law = droplet().model.amplitudes[0]
-    error = np.abs([distance_at(law, one) for one in bright] - printed)
-    assert 5e-4 < error.max() < 1.2e-3
 
 
 def test_a_table_passes_its_points_and_stays_between_them() -> None:
@@ -220,19 +204,3 @@ def test_an_unknown_name_lists_those_that_there_are() -> None:
         IrPlatformFileError, match=r"'dropled' is no packaged .* \(droplet, droplet_2016, epuck_twelve\)"
     ):
         load_ir_platform("dropled")
-
-
-def test_many_angles_at_once_have_the_values_of_each_alone() -> None:
-    angles = np.concatenate([np.linspace(-9.0, 9.0, 501), [0.6186, -0.6186, np.pi, -np.pi]])
-    for curve in (droplet().sensor, droplet().emitter, TabulatedCurve((-1.0, 0.0, 1.2), (0.1, 1.0, 0.2))):
-        found = np.empty((2, angles.size))
-        curves_at(curve.table(), angles.copy(), np.empty(angles.size), *found)
-        np.testing.assert_allclose(found.T, values(curve, angles), rtol=1e-14)
-
-
-@pytest.mark.parametrize("exponent", [2.0, 1.7])
-def test_many_distances_at_once_have_the_amplitudes_of_each_alone(exponent: float) -> None:
-    law, distances = np.array([1.4, -0.03, exponent, -1.0, 0.035]), np.linspace(0.001, 0.6, 101)
-    found = np.empty((2, distances.size))
-    amplitudes_at(law, distances, *found)
-    np.testing.assert_allclose(found.T, [amplitude_at(law, r) for r in distances], rtol=1e-14)

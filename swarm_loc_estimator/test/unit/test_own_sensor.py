@@ -1,9 +1,8 @@
-"""A sensor added from outside the product, that of the example, and the Jacobians of all models."""
+"""The sensor of the example, added from outside the product: in every filter, in any order, and its errors."""
 
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,45 +14,16 @@ from core_world import Plan, World, simulate
 from own_sensor import BEACONS, SIGMA_M, BeaconRows, BeaconSensor
 from scipy.stats import chi2
 
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, Verdict
+from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.filter.models import MODELS, Prediction
 from swarm_loc_estimator.filter.models import register as register_model
-from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, register
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
-BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
-LAYOUT = struct.Struct("<qqd")
 del SENSORS[BeaconSensor.name], MODELS[BeaconSensor.model]  # known in these tests only
-
-
-class RobotsToo(BeaconSensor):
-    """Distances to beacons, and to robots: beacon -1 - k is on robot k."""
-
-    name = topic = "distances"
-
-    def measure(self, rows: BeaconRows) -> Measurements:
-        """Convert readings (k,)."""
-        out = super().measure(rows._replace(beacon=np.maximum(rows.beacon, 0)))
-        out.reading[:], out.target[:] = rows.beacon, np.maximum(-1 - rows.beacon, NOBODY)
-        return out
-
-    @staticmethod
-    def predict(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
-        """Predict the distance."""
-        if one.target == NOBODY:
-            return BeaconSensor.predict(one, observer, target)
-        found = BeaconSensor.predict(one._replace(marker=target), observer, target)
-        (ux, uy, _), (x, y, _) = -found.observer_jacobian[0], target
-        return found._replace(target_jacobian=np.array([[ux, uy, uy * x - ux * y]]))
-
-
-Reading = tuple[int, bytes, int]  # Robot, message, stamp [ns]
 IN_ORDER = Settings(fusion_period_s=0.0)
 TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
 SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
@@ -62,51 +32,44 @@ ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["or
 
 @pytest.fixture(autouse=True)
 def _registered() -> Iterator[None]:
-    register(RobotsToo)
+    register(BeaconSensor)
     yield
-    del SENSORS[RobotsToo.name], MODELS[RobotsToo.model]
-
-
-def world_of(seed: int) -> World:
-    """Robots that see nothing."""
-    return simulate(Plan(4, 16.0, reach=0.0), seed)
-
-
-def distances(world: World, seed: int, outliers: float = 0.0) -> list[Reading]:
-    """Distances of all robots to two beacons and to the next robot, five times a second."""
-    rng, found = np.random.default_rng([seed, 9]), []
-    for k in range(4, world.stamp_ns.size, 4):
-        for robot in range(len(world.swarm.robots)):
-            other = (robot + 1) % len(world.swarm.robots)
-            for beacon in (1, 2, -1 - other):
-                there = BEACONS[beacon] if beacon > 0 else world.truth[k, other, :2]
-                distance = np.hypot(*(there - world.truth[k, robot, :2])) + rng.normal(0.0, SIGMA_M)
-                distance += 1.0 if rng.uniform() < outliers else 0.0
-                stamp_ns = int(world.stamp_ns[k])
-                found.append((robot, LAYOUT.pack(stamp_ns, beacon, distance), stamp_ns))
-    return found
+    del SENSORS[BeaconSensor.name], MODELS[BeaconSensor.model]
 
 
 def run(
-    world: World, measured: list[Reading], settings: Settings = IN_ORDER, late_s: float = 0.0
+    world: World,
+    settings: Settings = IN_ORDER,
+    late_s: float = 0.0,
+    outliers: float = 0.0,
+    *,
+    blind: bool = False,
 ) -> tuple[Estimator, list[Estimate]]:
-    """A world with readings, all of which are late by up to so much."""
-    rng, estimator, ingest = np.random.default_rng(0), Estimator(world.swarm, settings), Ingest(world.swarm)
-    events = [(e.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND), e) for e in world.events]
-    handles = [ingest.handle_of[f"{robot.name}/distances"] for robot in world.swarm.robots]
-    messages = [
-        SerializedMessage(handles[robot], data, stamp_ns + int(rng.uniform(0.0, late_s) * SECOND))
-        for robot, data, stamp_ns in measured
-    ]
+    """Robots that see two beacons five times a second, or nothing; all is late by up to so much."""
+    rng, late = np.random.default_rng(9), np.random.default_rng(0)
+    estimator, ingest, messages = Estimator(world.swarm, settings), Ingest(world.swarm), []
+    for k in range(4, 0 if blind else world.stamp_ns.size, 4):
+        for robot, one in enumerate(world.swarm.robots):
+            for beacon in (1, 2):
+                distance = np.hypot(*(BEACONS[beacon] - world.truth[k, robot, :2])) + rng.normal(0.0, SIGMA_M)
+                distance += 1.0 if rng.uniform() < outliers else 0.0
+                stamp_ns = int(world.stamp_ns[k])
+                data, arrival_ns = struct.pack("<qqd", stamp_ns, beacon, distance), late.uniform(0.0, late_s)
+                handle = ingest.handle_of[f"{one.name}/beacons"]
+                messages.append(SerializedMessage(handle, data, stamp_ns + int(arrival_ns * SECOND)))
     messages.sort(key=lambda message: message.log_ns)
+    events = [(e.stamp_ns + int(late.uniform(0.0, late_s) * SECOND), e) for e in world.events]
     estimates, begin_ns = [], T0 - 1
     for now_ns in ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25):
-        arrived = [one for one in messages if begin_ns < one.log_ns <= now_ns]
-        for part in ingest.read(MessageBatch.of(arrived)):
+        for part in ingest.read(MessageBatch.of([m for m in messages if begin_ns < m.log_ns <= now_ns])):
             estimator.receive(part)
         estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
         begin_ns = now_ns
     return estimator, estimates
+
+
+def world_of(seed: int, duration_s: float = 16.0) -> World:
+    return simulate(Plan(4, duration_s, reach=0.0), seed)
 
 
 def errors(world: World, estimates: list[Estimate]) -> tuple[FloatArray, FloatArray]:
@@ -116,25 +79,10 @@ def errors(world: World, estimates: list[Estimate]) -> tuple[FloatArray, FloatAr
     return error, np.array([e.covariances for e in whole])
 
 
-def rms(error: FloatArray) -> float:
-    """Root mean square of both components of positions."""
-    return float(np.sqrt(np.square(error[..., :2]).mean()))
-
-
 @ALL
-def test_distances_make_poses_better_and_the_errors_stay_as_large_as_the_covariances_say(
-    settings: Settings,
-) -> None:
-    squared, measured, blind = [], [], []
-    for seed in range(4):
-        world = world_of(900 + seed)
-        estimator, estimates = run(world, distances(world, seed), settings)
-        error, covariance = errors(world, estimates)
-        assert settled(estimator)["USED"] > 900
-        squared.append(nees(error, covariance).mean(axis=0))
-        measured.append(rms(error))
-        blind.append(rms(errors(world, run(world, [], settings)[1])[0]))
-    assert np.linalg.norm(measured) < 0.4 * np.linalg.norm(blind)
+def test_errors_are_as_large_as_the_covariances_say(settings: Settings) -> None:
+    worlds = [world_of(900 + seed) for seed in range(4)]
+    squared = [nees(*errors(world, run(world, settings)[1])).mean(axis=0) for world in worlds]
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * np.size(squared)) / np.size(squared)
     assert low < np.mean(squared) < high
 
@@ -142,53 +90,31 @@ def test_distances_make_poses_better_and_the_errors_stay_as_large_as_the_covaria
 @ALL
 def test_late_and_shuffled_readings_give_the_same(settings: Settings) -> None:
     world = world_of(910)
-    measured = distances(world, 1)
-    expected = run(world, measured, settings)[1][-1]
-    found = run(world, measured, settings, late_s=1.5)[1][-1]
+    (*_, expected), (*_, found) = (run(world, settings, late_s)[1] for late_s in (0.0, 1.5))
     np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
     np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)
 
 
 @ALL
 def test_outliers_are_gated_with_the_one_degree_of_freedom_of_the_model(settings: Settings) -> None:
-    np.testing.assert_allclose(MODELS[RobotsToo.model].gate([0.95, 0.999]), chi2.ppf([0.95, 0.999], 1))
-    world = world_of(920)
-    estimator, estimates = run(world, distances(world, 2, outliers=0.1), replace(settings, horizon_s=60.0))
+    estimator, _ = run(world_of(920), replace(settings, horizon_s=60.0), outliers=0.1)
     rows, verdicts, nis = estimator.recent()
     gated = verdicts == Verdict.GATED
     assert gated.sum() == pytest.approx(0.1 * rows.size, rel=0.3)
-    assert nis[gated].min() > chi2.ppf(RobotsToo.gate_probability, 1) >= nis[~gated].max()
-    assert rms(errors(world, estimates)[0]) < 0.05
+    assert nis[gated].min() > chi2.ppf(BeaconSensor.gate_probability, 1) >= nis[~gated].max()
 
 
 @ALL
 def test_a_model_that_fails_is_gated_and_leaves_poses_finite(settings: Settings) -> None:
     def predict(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
-        found = RobotsToo.predict(one, observer, target)
-        return found if one.target == NOBODY else found._replace(value=np.array([np.nan]))
+        found = BeaconSensor.predict(one, observer, target)
+        return found if one.reading == 1 else found._replace(value=np.array([np.nan]))
 
-    world, model = world_of(930), MODELS[RobotsToo.model]
-    MODELS[RobotsToo.model] = replace(model, predict=predict)
-    estimator, estimates = run(world, distances(world, 3), settings)
-    assert settled(estimator)["GATED"] > 300
-    assert settled(estimator)["USED"] > 600
-    error, covariance = errors(world, estimates)
-    assert np.isfinite(error).all()
-    assert np.isfinite(covariance).all()
-    assert rms(error) < 0.1
-
-
-def test_malformed_messages_are_counted_and_the_others_are_read() -> None:
-    world = world_of(950)
-    ingest = Ingest(world.swarm)
-    handle = ingest.handle_of[f"{world.swarm.robots[0].name}/distances"]
-    good = LAYOUT.pack(T0, 1, 2.0)
-    batch = MessageBatch.of([SerializedMessage(handle, one, T0) for one in (good, good[:7], b"", good)])
-    (part,) = ingest.read(batch)
-    assert part["distances"].distance.tolist() == [2.0, 2.0]
-    assert part.dropped == {"bad_message": 2}
-    (part,) = ingest.read(MessageBatch.of([SerializedMessage(handle, b"", T0)]))
-    assert part["distances"].robot.size == 0
+    MODELS[BeaconSensor.model] = replace(MODELS[BeaconSensor.model], predict=predict)
+    world = world_of(930)
+    estimator, estimates = run(world, settings)
+    assert min(settled(estimator)["GATED"], settled(estimator)["USED"]) > 250
+    assert all(np.isfinite(part).all() for part in errors(world, estimates))
 
 
 def fail(*_: object) -> Any:
@@ -208,22 +134,12 @@ def fail(*_: object) -> Any:
 def test_an_error_of_a_sensor_costs_its_own_readings_only_and_is_named(
     method: str, broken: Callable[..., Any], error: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    world = world_of(960)
-    measured, expected = distances(world, 5), run(world, [])[1][-1]
-    monkeypatch.setattr(RobotsToo, method, broken)
-    with pytest.warns(RuntimeWarning, match=f"'distances' raised {error}"):
-        estimator, estimates = run(world, measured)
-    assert estimator.drops == {f"distances_{error.partition(':')[0]}": len(measured)}
-    np.testing.assert_array_equal(estimates[-1].poses, expected.poses)
-
-
-def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
-    swarm = load_swarm(BAG / "swarm.yaml")
-    summary = read_bag(BAG, swarm, lambda _: None, unwatched)
-    assert [f"The bag holds no message on {robot.name}/distances." for robot in swarm.robots] == [
-        remark for remark in summary.remarks if "no message on" in remark
-    ]
-    assert not summary.unusable
+    world = world_of(960, 2.0)
+    monkeypatch.setattr(BeaconSensor, method, broken)
+    with pytest.warns(RuntimeWarning, match=f"'beacons' raised {error}"):
+        estimator, estimates = run(world)
+    assert estimator.drops == {f"beacons_{error.partition(':')[0]}": 80}
+    np.testing.assert_array_equal(estimates[-1].poses, run(world, blind=True)[1][-1].poses)
 
 
 @pytest.mark.parametrize(
@@ -247,51 +163,28 @@ def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
 def test_measurements_that_no_model_can_use_are_dropped_and_counted(
     field: str, value: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measure = RobotsToo.measure
+    measure = BeaconSensor.measure
 
-    def spoiled(self: RobotsToo, rows: BeaconRows) -> Measurements:
+    def spoiled(self: BeaconSensor, rows: BeaconRows) -> Measurements:
         found = measure(self, rows)
         getattr(found, field)[:] = getattr(found, value) if isinstance(value, str) else value
         return found
 
-    monkeypatch.setattr(RobotsToo, "measure", spoiled)
-    world = world_of(940)
-    measured = distances(world, 4)
-    estimator, estimates = run(world, measured)
-    assert estimator.drops["bad_measurement"] == len(measured)
-    np.testing.assert_array_equal(estimates[-1].poses, run(world, [])[1][-1].poses)
-
-
-@pytest.mark.parametrize(
-    "name", [*(model.name for model in MODELS.values() if model.predict is not None), RobotsToo.name]
-)
-@pytest.mark.parametrize("seed", range(3))
-def test_jacobians_of_all_models_agree_with_finite_differences(name: str, seed: int) -> None:
-    (model,) = [model for model in MODELS.values() if model.name == name]
-    rng, step, one = np.random.default_rng(seed), 1e-6, Measurements.empty(1)
-    one.model[:], one.observer[:], one.target[:], one.has_heading[:] = model.number, 0, 1, True
-    for column in (one.sensor, one.marker, one.height, one.reference):
-        column[:] = rng.normal(size=column.shape)
-    poses, row = rng.normal(size=(2, 3)), one.row(0)
-    predicted = model.predicted(row, *poses)
-    assert 1 <= model.gated <= predicted.value.size <= 3
-    for side, jacobian in enumerate((predicted.observer_jacobian, predicted.target_jacobian)):
-        for j in range(3):
-            moved = poses.copy()
-            moved[side] = se2.compose(se2.exp(step * np.eye(3)[j]), moved[side])
-            slope = model.innovation(model.predicted(row, *moved).value, predicted.value) / step
-            np.testing.assert_allclose(jacobian[:, j], slope, atol=2e-5)
+    monkeypatch.setattr(BeaconSensor, "measure", spoiled)
+    world = world_of(940, 2.0)
+    estimator, estimates = run(world)
+    assert estimator.drops == {"bad_measurement": 80}
+    np.testing.assert_array_equal(estimates[-1].poses, run(world, blind=True)[1][-1].poses)
 
 
 def test_a_name_stands_for_one_sensor_and_a_number_for_one_model() -> None:
-    with pytest.raises(ValueError, match="there is a sensor 'distances' already"):
-        register(RobotsToo)
-    number = RobotsToo.model
-    with pytest.raises(ValueError, match=f"the number {number} of the measurement model 'distances' is not"):
-        register_model(MODELS[number])
-
-
-@pytest.mark.parametrize("gated", [0, 4])
-def test_a_model_gates_one_to_three_components(gated: int) -> None:
-    with pytest.raises(ValueError, match=f"'distances' gates {gated} components but must gate 1, 2 or 3"):
-        register_model(replace(MODELS[RobotsToo.model], number=2000, gated=gated))
+    with pytest.raises(ValueError, match="there is a sensor 'beacons' already"):
+        register(BeaconSensor)
+    model = MODELS[BeaconSensor.model]
+    with pytest.raises(
+        ValueError, match=f"the number {model.number} of the measurement model 'beacons' is not"
+    ):
+        register_model(model)
+    for gated in (0, 4):
+        with pytest.raises(ValueError, match=f"'beacons' gates {gated} components but must gate 1, 2 or 3"):
+            register_model(replace(model, number=2000, gated=gated))

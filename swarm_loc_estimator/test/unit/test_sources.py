@@ -8,7 +8,7 @@ from core_messages import big_endian
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     decode_detections,
@@ -16,10 +16,8 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,
-    decode_pose_stamped,
     encode_fix,
     encode_odometry,
-    encode_pose_stamped,
 )
 from swarm_loc_estimator.common.messages.streams import (
     DetectionReader,
@@ -266,20 +264,6 @@ def test_a_quaternion_of_zeros_has_no_yaw() -> None:
     columns = PoseReader(1, decode_odometry, names=2).read(batch_of([bytes(data)] * 2))
     assert columns.valid.all()
     assert np.isnan(columns.pose[:, 2]).all()
-
-
-def test_ground_truth_reads_as_by_the_complete_reader() -> None:
-    poses = np.random.default_rng(1).uniform(-3, 3, (6, 3))
-    messages = [
-        encode_pose_stamped(frame, np.array([k]), poses[k : k + 1])[0]
-        for k, frame in enumerate(["a", "a", "bb", "a", "", "c"])
-    ]
-    messages += [big_endian(messages[1], POSE_STAMPED), messages[0][:-1], messages[0]]
-    columns = PoseReader(1, decode_pose_stamped, names=1).read(batch_of(messages))
-    assert columns.valid.tolist() == [True] * 7 + [False, True]
-    for k in np.flatnonzero(columns.valid).tolist():
-        one = decode_pose_stamped(messages[k])
-        assert (columns.stamp_ns[k], tuple(columns.pose[k])) == (one.stamp_ns, one.pose)
 
 
 NOW_NS, LONG_NS = 10**12, 10**9

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_OFFSET
-from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
@@ -77,49 +77,6 @@ def test_robots_described_with_sigmas_are_calibrated(content: int) -> None:
     assert_chi_square([simulate(plan, 600 + seed) for seed in range(4)])
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("content", [POSE, POSITION])
-def test_a_swarm_with_unknown_starts_finds_itself(content: int, seed: int) -> None:
-    world = simulate(Plan(3, 12.0, content=content, start_known=(False,), landmarks=5), seed)
-    estimator, estimates = run(world)
-    assert is_sparse(estimator)
-    assert (estimates[0].status == Status.WAITING).all()
-    assert (estimates[-1].status == Status.TRACKED).all()
-    assert distances(world, estimates)[-1].max() < 0.05
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_robot_that_sees_no_landmark_is_located_through_another(seed: int) -> None:
-    world = simulate(Plan(2, 15.0, start_known=(True, False), landmarks=4), seed)
-    for event in world.events:
-        if event.robot == 1:
-            event.detections["id"][event.detections["id"] >= 1000] = 99
-    estimates = run(world)[1]
-    distance = distances(world, estimates)
-    assert np.isfinite(distance[-1, 1])
-    assert np.nanmax(distance[:, 1]) < 0.3
-    assert estimates[-1].fix_age_s[1] == -1.0
-
-
-@pytest.mark.parametrize("content", [POSE, POSITION])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_robot_that_is_carried_away_is_lost_and_found_again_and_harms_nobody(
-    seed: int, content: int
-) -> None:
-    """It is lost because its sightings are gated and speak against it; its odometry knows nothing of it."""
-    world = simulate(Plan(4, 16.0, content=content, landmarks=6, carried=(0,)), seed)
-    estimator, estimates = run(world)
-    distance, status = distances(world, estimates), np.array([e.status for e in estimates])
-    carried, within = 41, 15  # ticks of 0.2 s
-    assert not distance[carried, 0] < 0.15  # not a number where it is lost already
-    assert Status.WAITING in status[carried : carried + within, 0]
-    assert Status.WAITING not in status[1:carried, 0]
-    assert settled(estimator)["GATED"] >= 3
-    assert distance[-1, 0] < 0.1
-    assert np.isfinite(distance[:, 1:]).all()
-    assert distance[:, 1:].max() < 0.15
-
-
 def misled(world: World, liar: int, from_ns: int, by: tuple[float, float]) -> World:
     """The world where one robot sees all that it sees off by so much, in its camera's frame [m]."""
     events = []
@@ -171,11 +128,3 @@ def test_a_survey_is_doubted_as_a_whole_where_a_third_landmark_contradicts_it_wi
     assert state.is_doubted == is_doubted
     opened = [state.landmark_column(k) >= 0 for k in range(8)]
     assert opened == [is_doubted or k == others for k in range(8)]
-
-
-def test_a_robot_that_leaves_does_not_hold_the_others_up() -> None:
-    world = simulate(Plan(4, 10.0), 3)
-    left = [e for e in world.events if e.robot != 2 or e.stamp_ns < T0 + 3 * SECOND]
-    estimates = run(replace(world, events=tuple(left)))[1]
-    assert estimates[-1].status[2] != Status.TRACKED
-    assert distances(world, estimates)[-1, [0, 1, 3]].max() < 0.05
