@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.identification.memory import IdentityMemory, convex_hull
+from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.identification.picture import AMBIGUOUS, UNSEEN, Picture, assign, log_ratios
 
 SIGMA, GATE = 0.02, 18.4
@@ -78,11 +78,3 @@ def test_what_lies_between_things_that_were_seen_is_in_view() -> None:
         memory.see(np.array([[5.0, 5.0]]), seconds * 10**9)
     assert not memory.is_in_view(places, np.full(3, 0.1)).any()
     assert copy.is_in_view(places, np.full(3, 0.1)).any()
-
-
-@given(st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=1, max_size=12))
-def test_a_hull_has_all_points_on_its_left(points: list[tuple[int, int]]) -> None:
-    hull = convex_hull(np.array(points, dtype=float))
-    for a, b in zip(hull, np.roll(hull, -1, axis=0), strict=True):
-        for x, y in points:
-            assert (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) >= 0.0 or len(hull) < 3

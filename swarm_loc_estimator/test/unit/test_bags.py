@@ -202,15 +202,6 @@ def record_of(opcode: int, content: bytes) -> bytes:
     return bytes([opcode]) + len(content).to_bytes(8, "little") + content
 
 
-def test_records_of_an_application_are_skipped(tmp_path: Path) -> None:
-    messages, path = some_messages(60), tmp_path / "x.mcap"
-    write_mcap(path, messages, compression=CompressionType.NONE, enable_crcs=False, use_chunking=False)
-    data, own = path.read_bytes(), record_of(0x80, b"hello")
-    place = data.index(messages[20][2]) + len(messages[20][2])
-    path.write_bytes(data[:place] + own + data[place:])
-    assert read(path) == (expected(messages), [])
-
-
 def test_records_of_an_application_inside_a_chunk_are_skipped(tmp_path: Path) -> None:
     messages, path, own = some_messages(8), tmp_path / "x.mcap", record_of(0xFF, b"")
     write_mcap(path, messages, compression=CompressionType.NONE, enable_crcs=False)

@@ -267,25 +267,6 @@ def test_a_saturation_that_is_lower_than_described_is_told_where_gains_fail_by_i
     assert " at 180 of 255 counts" in said
 
 
-@pytest.mark.parametrize(
-    ("out", "words"),
-    [
-        ("gains.png", "'gains.png' must end in .yaml"),
-        ("bag/x.yaml", "bag/x.yaml cannot be written: it is a folder"),
-        ("file/deep/x.yaml", "file cannot be written: "),
-    ],
-)
-def test_what_cannot_be_written_is_said_before_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, out: str, words: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "bag" / "x.yaml").mkdir(parents=True)
-    (tmp_path / "file").touch()
-    with pytest.raises(SystemExit):
-        calibrate_ir.main(["bag", "--out", out])
-    assert words in capsys.readouterr().err
-
-
 QUARTER = 0.5 * math.pi
 PLACES = {
     0x29: (300.0, 300.0, 0.3),

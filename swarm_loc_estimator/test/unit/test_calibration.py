@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.calibration.fit import (
     thinned,
 )
 from swarm_loc_estimator.offline.calibration.models import Options, fit_models, with_noise
-from swarm_loc_estimator.offline.calibration.motion import Lateness, drive_of, fit_response, nodes_of
+from swarm_loc_estimator.offline.calibration.motion import Lateness, drive_of, fit_response
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     Recording,
@@ -33,7 +33,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.sightings import population, ridge
+from swarm_loc_estimator.offline.calibration.sightings import ridge
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
@@ -257,32 +257,12 @@ def test_the_command_says_which_inputs_of_a_bag_it_does_not_use(
     assert load_swarm(out).robots[0].odometry.turn_noise > 0.0
 
 
-def test_nodes_follow_what_was_driven() -> None:
-    durations = np.ones(1000)
-    values = np.linspace(0.1, 0.5, 1000)
-    nodes = nodes_of(values, durations, 5)
-    assert nodes[0] == 0.0
-    assert nodes[1] == pytest.approx(0.104, abs=0.002)
-    assert nodes[-1] == pytest.approx(0.496, abs=0.002)
-    assert nodes_of(np.zeros(5), durations[:5], 5).tolist() == [0.0]
-    assert nodes_of(np.full(5, 0.3), durations[:5], 5).tolist() == [0.0, 0.3]
-
-
 def test_gross_errors_do_not_spoil_a_regression() -> None:
     rng = np.random.default_rng(1)
     basis = rng.standard_normal((200, 2))
     wanted = basis @ [2.0, -1.0] + 0.01 * rng.standard_normal(200)
     wanted[:20] += 5.0
     np.testing.assert_allclose(ridge(basis, wanted, 1e-9 * np.eye(2), np.zeros(2)), [2.0, -1.0], atol=0.02)
-
-
-def test_a_type_is_no_tighter_a_prior_than_its_robots_agree() -> None:
-    alike = np.ones((3, 1))
-    mean, sigma = population(alike, np.full((3, 1), 0.01), np.ones(1))
-    assert mean[0] == pytest.approx(1.0)
-    assert sigma[0] == pytest.approx(0.1)
-    _, apart = population(np.array([[0.0], [2.0]]), np.full((2, 1), 0.01), np.ones(1))
-    assert apart[0] == pytest.approx(1.0)
 
 
 def test_how_often_poses_are_wanted_changes_nothing_in_the_filter_of_a_dense_swarm() -> None:
@@ -318,21 +298,6 @@ def test_the_score_counts_error_consistency_and_poses_not_given() -> None:
     assert replace(fair, nees=2.0 * NEES_AIM).cost > fair.cost
     assert replace(fair, given=0.99).cost > fair.cost
     assert Score(np.nan, np.nan, np.nan, 0.0).cost > 10.0
-
-
-@pytest.mark.parametrize("seed", [7, 8])
-def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int) -> None:
-    centred = replace(TRUE, odometry=replace(TRUE.odometry, course_offset=0.0, axle_offset=0.0))
-    recording, swarm = record(World((robot(1, centred),), seed, 300.0))
-    alone = fit_models(replace(recording, truth={}), swarm, Options(alone=True), quiet)
-    for found in alone.swarm.robots:
-        assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)
-        assert found.sensor.bearing_scale == pytest.approx(0.97, abs=0.02)
-    errors = []
-    for name, path in alone.paths.items():
-        true, known = interpolate(recording.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
-        errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
-    assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
 
 
 @pytest.mark.parametrize("seed", [7, 8])

@@ -1,5 +1,6 @@
 """The doctor names what is wrong in graphs that were good until one thing was changed, and is silent else."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from wrong_setups import (
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli import doctor as command
+from swarm_loc_estimator.cli import survey
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
@@ -135,19 +137,26 @@ def test_a_whole_swarm_may_be_in_a_namespace(tmp_path: Path) -> None:
         assert bool(examine(evidence)) == is_wrong
 
 
+OUT = ["--out", "surveyed.yaml"]
+
+
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("main", "options", "said"),
     [
-        (["swarm.yaml", "--remap", "a:=b"], "--remap is for bags"),
-        (["bag", "--use-sim-time"], "--use-sim-time is for a live graph"),
-        (["bag", "--namespace", "two words"], "--namespace 'two words' must be names"),
-        (["nowhere"], "There is no bag 'nowhere'."),
+        (command.main, ["swarm.yaml", "--remap", "a:=b"], "--remap is for bags"),
+        (command.main, ["bag", "--use-sim-time"], "--use-sim-time is for a live graph"),
+        (command.main, ["bag", "--namespace", "two words"], "--namespace 'two words' must be names"),
+        (command.main, ["nowhere"], "There is no bag 'nowhere'."),
+        (survey.main, ["bag", "--seconds", "9", *OUT], "--seconds and --namespace are for a live graph"),
+        (survey.main, ["bag", "--use-sim-time", *OUT], "--use-sim-time is for a live graph"),
+        (survey.main, ["swarm.yaml", "--remap", "a:=b", *OUT], "--remap is for bags"),
+        (survey.main, ["swarm.yaml", "--namespace", "a b", *OUT], "--namespace 'a b' must be names"),
     ],
 )
-def test_wrong_options_end_with_one_sentence(
-    capsys: pytest.CaptureFixture[str], options: list[str], said: str
+def test_options_that_do_not_fit_the_source_end_with_one_sentence(
+    main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str], options: list[str], said: str
 ) -> None:
-    assert command.main(options) == 1
+    assert main(options) == 1
     assert said in capsys.readouterr().err
 
 

@@ -18,6 +18,7 @@ from swarm_loc_estimator.common.messages.cdr import (
     MESSAGE_PACKAGE,
     ROBOT_IDENTITIES,
     SEQUENCE,
+    SWARM_POSES,
     CdrError,
     fields_of,
 )
@@ -76,8 +77,14 @@ def test_swarm_poses_are_read_whoever_is_in_them(swarms: list[list[str]], seed: 
     for names in swarms * 2:
         one = estimate_of(names, seed)
         data = SwarmPosesEncoder(names, "map").encode(one.stamp_ns, *one[3:])
-        found = reader.read(data)
+        found, official = reader.read(data), typestore().deserialize_cdr(data, SWARM_POSES)
         assert found[:3] == one[:3]
+        assert [robot.name for robot in official.robots] == names
+        for k, robot in enumerate(official.robots):
+            told = (robot.x, robot.y, robot.theta, *robot.covariance)
+            np.testing.assert_array_equal(told, [*one.pose[k], *one.covariance[k].ravel()])
+            expected = (one.fix_age_s[k], one.status[k], one.heading_known[k])
+            assert (robot.fix_age_s, robot.status, robot.heading_known) == expected
         for mine, theirs in zip(found[3:], one[3:], strict=True):
             np.testing.assert_array_equal(mine, theirs)
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_geometry import homogeneous, optical_frame, planar, pose_of, seen, wrapped
+from core_geometry import homogeneous, planar, pose_of, seen, wrapped
 from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, detection, joined
+from lost_world import Alone
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -306,30 +307,10 @@ def test_an_upright_face_with_two_poses_does_not_locate_alone() -> None:
     assert only.status[0] == Status.WAITING
 
 
-def test_the_optical_frame_of_a_fixed_camera_looks_down() -> None:
-    """Of a camera over the origin, the image's right is map's -y, and its top is map's x."""
-    frame = optical_frame(CameraMount(z=2.0, pitch=math.pi / 2))
-    np.testing.assert_allclose(frame[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
-
-
-class Silence:
-    """A graph in which nobody publishes."""
-
-    def duplicate_publishers(self, topic: str) -> list[str]:
-        """None."""
-        return [] if topic else [""]
-
-    def why_missing(self, topic: str, message_type: str) -> str:
-        """That nobody does."""
-        assert topic
-        assert message_type
-        return " (no publisher)"
-
-
 def test_a_described_camera_has_a_topic_that_is_missed_and_its_drops_are_named() -> None:
     swarm = Swarm((STANDING,), (), CAMERAS[:2])
     ingest = Ingest(swarm, topics=live_topics(swarm, shared=False))
-    diagnostics = Diagnostics(swarm, ingest, EstimatorParameters(), Silence(), [])
+    diagnostics = Diagnostics(swarm, ingest, EstimatorParameters(), Alone(" (no publisher)"), [])
     data = encode_detections("straight", T0, np.zeros(0, DETECTION_DTYPE))
     message = SerializedMessage(ingest.handle_of["straight/detections"], data, T0)
     list(ingest.read(MessageBatch.of([message])))

@@ -328,15 +328,6 @@ def test_fusing_keeps_its_guaranteed_part_of_a_node_that_is_always_busy() -> Non
     assert max(taken[100:]) < 0.15
 
 
-def test_a_little_is_always_used() -> None:
-    shedding = Shedding(0.1, HORIZON_S)
-    for second in range(50):
-        shedding.begin_tick(float(second), 1.0)
-        shedding.begin_fusion()
-        shedding.note(1.0, 1.0)
-    assert shedding.share == MIN_SHARE
-
-
 def test_a_node_that_is_busy_for_a_while_and_catches_up_again_leaves_nothing_out() -> None:
     """As at its start: all memory is written to for the first time, and all robots are placed."""
     machine = Machine(fusing=2.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from core_messages import T0
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -87,36 +87,6 @@ def test_scale_bias_and_a_varying_rate_are_integrated_exactly() -> None:
     end_s = float(seconds(odometry)[-1])
     expected = 1.02 * 0.2 * end_s**2 + 0.03 * end_s
     assert look(track, end_s).pose[0, 2] == pytest.approx(expected, abs=1e-9)
-
-
-@settings(deadline=None)
-@given(seed=st.integers(0, 2**32), parts=st.integers(1, 6))
-def test_the_order_of_arrival_does_not_matter(seed: int, parts: int) -> None:
-    rng = np.random.default_rng(seed)
-    odometry, gyro = stamps(10, 0.0, 3.0), stamps(40, -0.2, 3.2)
-    gyro = gyro[rng.uniform(size=gyro.size) > 0.2]  # with gaps, some longer than the time-out
-    rates, raw = rng.normal(0.0, 1.0, gyro.size), straight(odometry)
-    at_s = np.linspace(0.0, 3.3, 40).tolist()
-    one = tracks(replace(GYRO, timeout_s=0.08))
-    turn(one, gyro, rates)
-    feed(one, odometry, raw)
-    expected = look(one, *at_s)
-    other = tracks(replace(GYRO, timeout_s=0.08))
-    places = [*(("gyro", part) for part in np.array_split(rng.permutation(gyro.size), parts))]
-    places += [("odometry", part) for part in np.array_split(rng.permutation(odometry.size), parts)]
-    last = np.zeros(len(at_s))
-    for k in rng.permutation(len(places)).tolist():
-        kind, rows = places[k]
-        if kind == "gyro":
-            changed_ns = turn(other, gyro[rows], rates[rows])
-            now = look(other, *at_s).pose[:, 2]
-            before = T0 + np.rint(1e9 * np.array(at_s)) <= changed_ns
-            np.testing.assert_array_equal(now[before], last[before])  # what had not changed is as it was
-        else:
-            feed(other, odometry[rows], raw[rows])
-        last = look(other, *at_s).pose[:, 2]
-    for name in ("pose", "covariance", "jacobian"):
-        np.testing.assert_allclose(getattr(look(other, *at_s), name), getattr(expected, name), atol=1e-9)
 
 
 def test_turns_of_the_wheels_bridge_gaps_and_are_not_calibrated_by_the_gyroscope() -> None:

@@ -1,7 +1,6 @@
 """Laws of a swarm that hears each other's light: located through IR alone, honestly, in any order."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +8,9 @@ from core_geometry import nees, wrapped
 from core_run import settled
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ir_swarm import SECOND, Event, Light, Plan, Run, play, simulate, write_bag
+from ir_swarm import SECOND, Event, Light, Plan, Run, play, simulate
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -107,30 +104,3 @@ def test_lateness_loss_and_repetition_of_matrices_change_nothing(
     assert one_counts == other_counts
     assert other_drops.pop("duplicate", 0) == one_drops.pop("duplicate", 0) + len(doubled)
     assert one_drops == other_drops
-
-
-def test_a_bag_gives_the_same_poses_byte_for_byte_and_those_of_the_estimator_fed_by_hand(
-    tmp_path: Path,
-) -> None:
-    run = simulate(Plan(seconds=10.0, fixed=[0, 8], walking=True), 2)
-    rng = np.random.default_rng(2)
-    late = [(event.stamp_ns + int(rng.uniform(0.0, 0.4) * SECOND), event) for event in run.events]
-    bag = write_bag(run, tmp_path / "bag", late)
-    swarm = load_swarm(bag / "swarm.yaml")
-    assert swarm == run.swarm
-    first, second = (replay(bag, swarm, SLOW, tick_s=0.5) for _ in range(2))
-    assert first.poses.tobytes() == second.poses.tobytes()
-    assert first.covariances.tobytes() == second.covariances.tobytes()
-    assert first.counters == second.counters
-    _, estimates = play(run, late, SLOW, 0.5)
-    by_hand = {estimate.stamp_ns: estimate.poses for estimate in estimates}
-    both = [k for k, stamp_ns in enumerate(first.stamp_ns.tolist()) if stamp_ns in by_hand]
-    assert len(both) > 15
-    expected = np.array([by_hand[int(first.stamp_ns[k])] for k in both])
-    np.testing.assert_allclose(first.poses[both], expected, atol=1e-9)
-    assert np.isfinite(first.poses[-1]).all()
-    lights = sum(isinstance(event, Light) for event in run.events)
-    assert first.counters["messages on <robot>/brightness"] == lights
-    assert first.counters["messages on <robot>/fix"] == 20
-    assert 0.9 * lights / 2 < first.counters["infrared exchanges measured"] <= lights / 2
-    assert not first.remarks

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_geometry import marker_frame, seen, wrapped
-from core_messages import POSE, SECOND, T0, detection
+from core_geometry import wrapped
+from core_messages import SECOND, T0
 from core_run import covariance_of_places, on_time, play, ticks
-from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
+from core_world import MOUNT, Plan, World, lasting_errors, simulate
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.replay import main
@@ -18,9 +18,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, decode, encode
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import SELF_CALIBRATED
-from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import learns
@@ -117,20 +116,6 @@ def test_what_was_learned_may_be_trusted_from_then_on() -> None:
             _, errors = run(replace(world, swarm=exact(swarm)), Settings(max_fault_score=1e9))
             squared.append(float(np.nanmean(np.square(errors[5:, :, :2]))))  # not a number where one got lost
     assert np.mean(after) < 0.25 * np.mean(before)
-
-
-def test_a_distance_scale_is_taken_out_of_what_is_seen() -> None:
-    frame = seen([0.0, 0.0, 0.0], MOUNT, marker_frame(1.0, 0.3, 0.1, 3.0))
-    values = []
-    for scale in (1.0, 1.25):
-        far = frame.copy()
-        far[:3, 3] *= scale
-        robot = Robot("a", camera=MOUNT, sensor=replace(SENSOR, distance_scale=scale))
-        swarm = Swarm((robot,), (Landmark(7, 1.0, 0.3, 0.1, 3.0),))
-        stamp = np.array([T0])
-        rows = DetectionRows(np.zeros(1, np.int64), stamp, detection(7, far, POSE), stamp)
-        values.append(SightingConverter(swarm).convert(rows).value)
-    np.testing.assert_allclose(values[1], values[0], atol=1e-12)
 
 
 def test_there_is_nothing_to_learn_where_nothing_has_a_sigma() -> None:

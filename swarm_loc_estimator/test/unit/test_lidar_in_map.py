@@ -13,14 +13,11 @@ from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.messages import ScanMessage
-from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.sensors.inputs import Ingest, input_topics
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
@@ -214,19 +211,6 @@ def test_the_order_of_arrival_does_not_matter(room: Path) -> None:
         assert estimator.used == 6
     assert results[1].poses == pytest.approx(results[0].poses, abs=1e-9)
     assert results[1].covariances == pytest.approx(results[0].covariances, abs=1e-9)
-
-
-def test_a_bag_gives_the_same_poses_twice_byte_for_byte(room: Path, tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("a/odom", ODOMETRY)
-        bag.add_topic("a/scan", LASER_SCAN)
-        for topic, at_ns, data in sent(5_000_000_000, seed=2):
-            bag.write(topic, at_ns, data)
-    swarm = swarm_at(room, LidarRobot.start + np.array([0.05, 0.0, 0.0]))
-    first, second = (replay(tmp_path / "bag", swarm) for _ in range(2))
-    assert first.poses.tobytes() == second.poses.tobytes()
-    assert first.covariances.tobytes() == second.covariances.tobytes()
-    assert first.poses[-1, 0, :2] == pytest.approx(LidarRobot().pose(int(first.stamp_ns[-1]))[:2], abs=CELL)
 
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.6)])

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import wrapped
-from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, room_map, scan_bytes
+from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, room_map
 from test_lidar_in_map import CELL, ODOMETRY_NS, hand_in, sent, swarm_at
 
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import compose
 from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.filter.models import SCAN
-from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -62,38 +60,13 @@ def test_a_robot_that_stands_is_not_believed_to_be_anywhere(room: Path) -> None:
 
 def test_a_robot_in_a_symmetric_room_says_that_it_may_be_at_several_places(tmp_path: Path) -> None:
     """A rectangle looks the same from its other end."""
-    whole = room_map(CELL)
-    inside = np.zeros(whole.log_odds.shape, dtype=bool)
-    low, high = whole.index(np.array([ROOM[:2], ROOM[2:]]))
-    inside[low[0] : high[0] + 1, low[1] : high[1] + 1] = True
-    edge = inside.copy()
-    edge[low[0] + 1 : high[0], low[1] + 1 : high[1]] = False
-    odds = np.where(edge, 5.0, np.where(inside, -5.0, 0.0))
-    path, _ = save_map(OccupancyMap(whole.corner, CELL, odds), tmp_path / "rectangle")
-    size = (high - low) * CELL
-    estimator, robot, messages = Estimator(without_start(path)), LidarRobot(), []
-    for at_ns in range(0, 9 * SECOND, ODOMETRY_NS):
-        pose, unknown = robot.odometry(np.array([at_ns])), UNKNOWN_COVARIANCE
-        frames, stamps = ("a/odom", "a/base_link"), np.array([at_ns])
-        data = encode_odometry(*frames, stamps, pose, np.zeros((1, 3)), unknown, unknown)[0]
-        messages.append(("a/odom", at_ns, data))
-        if at_ns % SWEEP_NS == 0 and at_ns:
-            scan = robot.scan(at_ns - SWEEP_NS)
-            beams = np.arange(BEAMS)
-            mount = compose(
-                compose(robot.start, robot.odometry(at_ns - SWEEP_NS + SWEEP_NS // BEAMS * beams)),
-                [estimator.swarm.robots[0].lidar.x, estimator.swarm.robots[0].lidar.y, 0.5 * math.pi],
-            )
-            angle = mount[:, 2] + scan.angle_increment * beams
-            corner = whole.corner + (low + 0.5) * CELL
-            away = np.where(
-                np.stack([np.cos(angle), np.sin(angle)]) > 0.0, (corner + size)[:, None], corner[:, None]
-            )
-            with np.errstate(divide="ignore"):
-                ways = (away - mount[:, :2].T) / np.stack([np.cos(angle), np.sin(angle)])
-            scan = scan._replace(ranges=np.abs(ways).min(axis=0), range_max=9.0)
-            messages.append(("a/scan", at_ns, scan_bytes(scan)))
-    estimates = hand_in(estimator, messages)
+
+    class InRectangle(LidarRobot):
+        has_niche = False
+
+    path, _ = save_map(room_map(CELL, has_niche=False), tmp_path / "rectangle")
+    estimator = Estimator(without_start(path))
+    estimates = hand_in(estimator, sent(9 * SECOND, 1, kind=InRectangle))
     assert {int(one.status[0]) for one in estimates} == {Status.WAITING}
     assert estimator.drops["scan_ambiguous"] > 10
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import wrapped
-from mapping_world import NICHE, LidarRobot, room_map
+from mapping_world import LidarRobot, room_map
 from test_lidar_in_map import CELL, hand_in, sent, swarm_at
 
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, encode
-from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map, map_of_message, save_map
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.replay import replay
@@ -47,15 +47,6 @@ def by_topic(start: Any = LidarRobot.start) -> Swarm:
     swarm = swarm_at(None, LidarRobot.start if start is None else start)
     robot = swarm.robots[0] if start is not None else replace(swarm.robots[0], start=None)
     return replace(swarm, robots=(robot,), map="topic")
-
-
-def without_niche() -> OccupancyMap:
-    """The room as a mere rectangle, which looks the same from its other end."""
-    whole = room_map(CELL)
-    odds, low, high = whole.log_odds.copy(), *whole.index(np.array([NICHE[:2], NICHE[2:]]))
-    odds[low[0] - 1 : high[0] + 2, low[1] + 1 :] = 0.0
-    odds[low[0] - 1 : high[0] + 2, low[1]] = LOG_ODDS_CAP
-    return replace(whole, log_odds=odds)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -108,7 +99,9 @@ def test_cells_count_by_the_thresholds_of_map_server() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_located_robot_stays_and_one_that_is_searched_begins_anew(seed: int) -> None:
     """The first map has a place too many; in the second one there is only one."""
-    first, second = (("map", at, map_bytes(one)) for at, one in ((0, without_niche()), (1, room_map(CELL))))
+    first, second = (
+        ("map", at, map_bytes(one)) for at, one in ((0, room_map(CELL, has_niche=False)), (1, room_map(CELL)))
+    )
     messages = sent(12 * SECOND, seed)
     late = (second[0], 5 * SECOND, second[2])
     changed = sorted([first, *messages, late], key=lambda one: one[1])

@@ -487,38 +487,9 @@ def test_a_light_seen_twice_in_one_scan_of_wheels_that_slip_is_in_one_direction(
     assert wrap_angle(mapper.graph.poses[begin, 2] - heading) == pytest.approx(0.0, abs=math.radians(2.0))
 
 
-def test_stops_are_told_from_drives() -> None:
-    robot = RoomRobot(START, 0.0, None)
-    parts = [robot.turn(1.0), robot.drive(0.5), robot.turn(-0.7), robot.drive(0.4)]
-    tracker = MotionTracker()
-    runs = [
-        (run.stands, run.arrives, len(run.readings.stamp_ns)) for part in parts for run in tracker.runs(part)
-    ]
-    assert [run[:2] for run in runs if run[1]] == [(True, True)] * 2
-    assert sum(run[2] for run in runs) == sum(len(part.stamp_ns) for part in parts)
-    assert not runs[-1][0]
-
-
-def test_a_rest_ends_a_look_around() -> None:
-    stop = ScanStop(np.zeros(3))
-    count = 120
-    odometry = np.zeros((count, 3))
-    odometry[:, 2] = np.minimum(0.02 * np.arange(count), 0.8)
-    stop.extend(Readings(20_000_000 * np.arange(count), odometry, np.ones(count), 0.016))
-    assert 40 + 50 <= stop.completed(6.0) <= 40 + 52
-    assert stop.completed(0.5) == 26
-    assert stop.turn_at(10 * 20_000_000) == pytest.approx(0.2)
-
-
 def test_a_stop_without_end_is_bounded() -> None:
     stop = ScanStop(np.zeros(3))
     for k in range(20):
         stop.extend(Readings(np.arange(1000) + 1000 * k, np.zeros((1000, 3)), np.ones(1000), 0.016))
     assert len(stop.turn) <= 4096
     assert stop.stamp_ns[-1] == 19_999
-
-
-def test_the_room_is_as_it_should_be() -> None:
-    assert distance_in_room(1.0, 1.0, 0.0) == pytest.approx(2.4)
-    assert distance_in_room(1.5, 1.0, math.pi / 2) == pytest.approx(2.1)
-    assert distance_in_room(0.5, 1.0, math.pi / 2) == pytest.approx(1.6)

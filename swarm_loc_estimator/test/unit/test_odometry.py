@@ -167,18 +167,6 @@ def test_a_robot_without_odometry_may_walk_at_random() -> None:
     np.testing.assert_allclose(gained, expected, rtol=1e-6)
 
 
-def test_noise_of_a_straight_drive_in_closed_form() -> None:
-    track, stamps = tracks(), stamps_until(2.0)
-    feed(track, stamps, arc(0.3, 0.0, (stamps - T0) * 1e-9))
-    k, d, length = PLAIN.wheel_noise, PLAIN.wheel_separation, 0.6
-    heading = 2.0 * k * length / d**2
-    noise = look(track, int(stamps[-1])).covariance[0]
-    assert noise[0, 0] == pytest.approx(0.5 * k * length)
-    assert noise[2, 2] == pytest.approx(heading)
-    assert noise[1, 2] == pytest.approx(-heading * length / 2, rel=1e-9)  # lever arm about the track's origin
-    assert noise[1, 1] == pytest.approx(heading * length**2 / 3, rel=1e-2)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
     rng = np.random.default_rng(seed)

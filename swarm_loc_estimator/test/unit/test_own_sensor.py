@@ -1,4 +1,4 @@
-"""The sensor of the example, added from outside the product: in every filter, in any order, and its errors."""
+"""The sensor of the example, added from outside the product: in every filter, in any order, its errors."""
 
 import struct
 from collections.abc import Callable, Iterator

@@ -16,7 +16,6 @@ from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from rosbags.typesys import get_types_from_msg
 from test_bags import START, TOPICS, expected, read, some_messages, write_bag, write_mcap, write_sqlite
 
 from bench.shared.full_disk import full_after
@@ -25,7 +24,7 @@ from swarm_loc_estimator.common.bags.bag_file import ReadErrors
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, offered_qos, unpack_messages
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.files import FileError
-from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder, TransformsEncoder, encode_poses
+from swarm_loc_estimator.common.messages.poses import TransformsEncoder, encode_poses
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.offline.result import Spool
 
@@ -202,14 +201,11 @@ def test_profiles_of_all_versions(profiles: object) -> None:
     assert found["b/odom"] == []
 
 
-@pytest.mark.parametrize("damage", ["]", "reliable", [{"depth": 1}], [3], 7, [{**NEW, "deadline": None}]])
-def test_damaged_profiles_are_none(damage: object) -> None:
-    assert offered_qos(_metadata(damage)) == {"b/odom": []}
-
-
-@pytest.mark.parametrize("damage", [None, 7, [None], [{"topic_metadata": 3}], [{"topic_metadata": {}}]])
-def test_damaged_topics_have_none(damage: object) -> None:
-    assert offered_qos({"topics_with_message_count": damage}) == {}
+def test_damaged_profiles_and_topics_are_none() -> None:
+    for profiles in ("]", "reliable", [{"depth": 1}], [3], 7, [{**NEW, "deadline": None}]):
+        assert offered_qos(_metadata(profiles)) == {"b/odom": []}
+    for topics in (None, 7, [None], [{"topic_metadata": 3}], [{"topic_metadata": {}}]):
+        assert offered_qos({"topics_with_message_count": topics}) == {}
 
 
 def test_rows_come_back_by_key_in_their_order() -> None:
@@ -259,11 +255,8 @@ COVARIANCES = np.arange(27.0).reshape(3, 3, 3)
 
 def read_outputs(data: bytes, message_type: str) -> Any:
     """The message object; equal to the bytes again when serialized, so nothing is missing or too much."""
-    store = typestore()
-    if message_type not in store.fielddefs:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", message_type))
-    message = store.deserialize_cdr(data, message_type)
-    assert bytes(store.serialize_cdr(message, message_type)).rstrip(b"\x00") == data.rstrip(b"\x00")
+    message = typestore().deserialize_cdr(data, message_type)
+    assert bytes(typestore().serialize_cdr(message, message_type)).rstrip(b"\x00") == data.rstrip(b"\x00")
     return message
 
 
@@ -274,23 +267,6 @@ def stamp_ns(message: Any) -> int:
 def yaw(quaternion: Any) -> float:
     assert quaternion.x == quaternion.y == 0.0
     return float(2.0 * np.arctan2(quaternion.z, quaternion.w))
-
-
-@pytest.mark.parametrize("frame", ["map", "world", ""])
-def test_swarm_poses(frame: str) -> None:
-    encoder = SwarmPosesEncoder(NAMES, frame)
-    ages, status = np.array([0.5, 1.5, -1.0]), np.array([1, 2, 0], np.uint8)
-    known = np.array([False, True, False])
-    for stamp in (5, STAMP_NS):
-        message = read_outputs(
-            encoder.encode(stamp, POSES, COVARIANCES, ages, status, known), "swarm_loc_msgs/msg/SwarmPoses"
-        )
-        assert (stamp_ns(message), message.header.frame_id) == (stamp, frame)
-    assert [robot.name for robot in message.robots] == NAMES
-    for k, robot in enumerate(message.robots):
-        assert np.array_equal([robot.x, robot.y, robot.theta], POSES[k], equal_nan=True)
-        assert np.array_equal(robot.covariance, COVARIANCES[k].ravel())
-        assert (robot.fix_age_s, robot.status, robot.heading_known) == (ages[k], status[k], known[k])
 
 
 def test_robot_poses_are_sure_of_the_plane_but_not_beyond_doubt() -> None:

@@ -99,17 +99,6 @@ def test_a_chain_is_as_unsure_as_its_odometry_adds_up() -> None:
     assert deviations[:2] == pytest.approx([0.04, 0.02], rel=0.02)
 
 
-def test_stops_outgrow_the_room_that_there_was() -> None:
-    graph = PoseGraph(MapperSettings())
-    graph.add_robot()
-    for k in range(150):
-        stop = graph.add_stop(0, np.array([k, 0.0, 0.0]), 0.02)
-        graph.set_scan(stop, Scan(np.linspace(0.0, 1.0, 10), np.full(10, 0.5)))
-    assert graph.count == 150
-    assert (graph.scans.beams.counts[:150] == 10).all()
-    assert graph.poses[:, 0].tolist() == list(range(150))
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_a_wall_that_only_one_robot_sees_tells_nothing_of_where_the_other_is(seed: int) -> None:
     """The first scans of two robots in a corridor, of whom one sees its end."""

@@ -152,16 +152,6 @@ def test_a_camera_that_sways_forgets_its_yaw_and_keeps_its_variance() -> None:
         np.testing.assert_allclose(found.filter.covariance[3:, 3:], wanted, rtol=1e-9)
 
 
-def test_parameters_not_asked_for_have_no_columns() -> None:
-    tracks, state = drive(0.1, 0.3, 1.0)
-    assert state.filter.covariance.shape == (9, 9)
-    to(state, tracks, 1.0, robot=1)
-    assert not state.filter.covariance[3:6, 6:].any()
-    table = ParameterTable.of([Robot("b")])
-    assert table.filter_size == 3
-    assert (table.column == -1).all()
-
-
 def test_losing_a_robot_keeps_what_was_learned_of_its_sensors_and_not_how_that_depends_on_its_pose() -> None:
     tracks, state = drive(0.1, 0.3, 1.0)
     state.parameter[0, :3] = [0.02, 0.02, -0.01]

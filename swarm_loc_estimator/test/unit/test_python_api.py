@@ -13,14 +13,11 @@ import numpy as np
 import pytest
 
 import swarm_loc_estimator
-from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
-from swarm_loc_estimator.offline.export import write_tum
-from swarm_loc_estimator.offline.report.report import text_report
+from swarm_loc_estimator import Batch, Estimator, OdometryRows, Robot, Swarm, replay
 from swarm_loc_estimator.sensors.inputs import SENSORS
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"
-EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_and_plot.py"
 BAG = ROOT / "bags" / "eight_five_robots"
 SWARM = Swarm((Robot("robot1"),))
 TWO = np.zeros(2, np.int64)
@@ -40,11 +37,6 @@ def run(*arguments: str, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-@pytest.fixture(scope="module")
-def result() -> ReplayResult:
-    return replay(BAG)
 
 
 def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
@@ -130,29 +122,3 @@ def test_the_page_has_the_columns_of_every_sensor() -> None:
         needed, _, optional = rows[name].partition(" | ")
         assert {one for one in fields - {*sensor.optional} if f"`{one}`" not in needed} == set()
         assert {one for one in fields & {*sensor.optional} if f"`{one}`" not in optional} == set()
-
-
-def test_the_example_prints_the_errors_of_the_report(result: ReplayResult, tmp_path: Path) -> None:
-    _, *lines, _ = run(str(EXAMPLE), str(BAG), str(tmp_path / "picture.png")).splitlines()
-    report = text_report(result).splitlines()
-    assert [line.split()[0] for line in lines] == [*result.errors, "all"]
-    for line in lines:
-        name, position, heading, nees = line.split()
-        (row,) = [one.split() for one in report if one.startswith(f"{name} ")]
-        assert (position, heading, nees) == (row[2], row[7], row[12])
-
-
-def test_exported_trajectories_have_the_errors_of_the_report(result: ReplayResult, tmp_path: Path) -> None:
-    write_tum(result, tmp_path)
-    assert len([*tmp_path.iterdir()]) == 10
-    for name, summary in result.summaries.items():
-        found, truth = (np.loadtxt(tmp_path / f"{name}{end}.tum") for end in ("", ".truth"))
-        found = found[np.isin(found[:, 0], truth[:, 0])]
-        assert np.array_equal(found[:, 0], truth[:, 0])
-        away = np.linalg.norm(found[:, 1:3] - truth[:, 1:3], axis=1)
-        assert np.sqrt(np.mean(away**2)) == pytest.approx(summary.position_rmse, abs=1e-9)
-        turn = 2.0 * (np.arctan2(found[:, 6], found[:, 7]) - np.arctan2(truth[:, 6], truth[:, 7]))
-        turn = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
-        assert np.sqrt(np.mean(turn**2)) == pytest.approx(summary.heading_rmse, abs=1e-9)
-    stamps = (tmp_path / "epuck1.tum").read_text(encoding="utf-8").split("\n", 1)[0].split()[0]
-    assert int(stamps.replace(".", "")) in result.stamp_ns

@@ -51,13 +51,6 @@ def test_a_robot_that_turns_to_and_fro_tells_the_delay(late_s: float) -> None:
         assert belief.is_refuted == (late_s > 0.06)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.3])
-def test_a_described_delay_is_compared_with_the_true_one(late_s: float) -> None:
-    belief = after(described_delay(-0.3), weaving, late_s - 0.3, 1)
-    assert belief.mean_s == pytest.approx(late_s - 0.3, abs=0.02)
-    assert belief.is_refuted == (late_s == 0.0)
-
-
 @pytest.mark.parametrize("path", [straight, circling])
 def test_steady_motion_tells_nothing_and_poses_are_right_within_that(path: Path) -> None:
     now = np.array([14.8])

@@ -4,7 +4,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +30,7 @@ from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
@@ -39,6 +39,7 @@ from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Anchor, CameraMount, FixedCamera, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 BAGS = Path(__file__).parents[3] / "bags"
 PLAN = Plan(robots=3, duration_s=16.0, start_known=(False,))
@@ -244,6 +245,18 @@ def test_a_drift_of_the_turn_rate_is_that_of_the_track() -> None:
     np.testing.assert_allclose(problem.drift.turn, by_difference, atol=0.01 * np.abs(by_difference).max())
 
 
+def run(recording: Recording, swarm: Swarm) -> ReplayResult:
+    """The online poses by all inputs."""
+    runner = Runner(Estimator(swarm), PeriodicSchedule(100_000_000))
+    runner.take(
+        replace(recording.messages, rows={**recording.messages.rows, "fixes": recording.fixes})
+        if recording.fixes.robot.size
+        else recording.messages
+    )
+    runner.finish(recording.range_ns[1])
+    return runner.result(recording.name, recording.range_ns, recording.truth, {})
+
+
 def errors_of(result: ReplayResult, world: World) -> tuple[FloatArray, FloatArray]:
     """Errors (k, 3) and their covariances, each second from the third on."""
     rows = np.flatnonzero(result.stamp_ns % 1_000_000_000 == 0)[3:-1]
@@ -274,30 +287,6 @@ def test_poses_are_better_than_online_ones_and_as_good_as_they_say(sensor: str, 
     assert least < np.mean(normalized) < 4.0
 
 
-def run(recording: Recording, swarm: Swarm) -> ReplayResult:
-    """The online poses by all inputs."""
-    from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
-    from swarm_loc_estimator.sensors.inputs import Batch
-    from swarm_loc_estimator.timeline.estimator import Estimator
-
-    runner = Runner(Estimator(swarm), PeriodicSchedule(100_000_000))
-    rows: dict[str, Any] = {
-        "odometry": recording.odometry,
-        "imu": recording.turn_rates,
-        "detections": recording.detections,
-        "fixes": recording.fixes,
-        "ranges": recording.ranges,
-    }
-    in_order = {
-        name: select(one, np.argsort(one.arrival_ns, kind="stable"))
-        for name, one in rows.items()
-        if one.robot.size
-    }
-    runner.take(Batch.of(*recording.range_ns, **in_order))
-    runner.finish(recording.range_ns[1])
-    return runner.result(recording.name, recording.range_ns, recording.truth, {})
-
-
 def test_a_landmark_that_has_moved_and_is_opened_online_is_so_in_the_batch() -> None:
     moved = 0.06
     squares = {name: list[float]() for name in ("exact", "opened", "as it is")}
@@ -309,7 +298,7 @@ def test_a_landmark_that_has_moved_and_is_opened_online_is_so_in_the_batch() -> 
         learned = replace(described, landmarks=(opened(described.landmarks[0]), *others))
         cases = ((described, None), (described, learned), (swarm, None))
         for name, (one, now) in zip(squares, cases, strict=True):
-            online = replace(run(recording, one), self_calibrated=now)
+            online = replace(rerun(recording, one, 0.1), self_calibrated=now)
             error, _ = errors_of(smooth_recording(recording, online), world)
             squares[name] += np.sum(error[:, :2] ** 2, axis=1).tolist()
     exact, found, right = (float(np.mean(one)) for one in squares.values())
@@ -335,19 +324,6 @@ def test_covariances_are_those_of_many_worlds() -> None:
     assert 2.4 < np.mean(normalized) < 3.6
 
 
-def test_the_inverse_in_the_band_is_that_of_the_whole_matrix() -> None:
-    rng = np.random.default_rng(1)
-    normal = ChainEquations(12, 4, 3)
-    for k in range(9):
-        columns = np.array([[k, k + 2, k + 3, 12 + k % 3]])
-        normal.add(rng.standard_normal((1, 5, 4)), columns, np.zeros((1, 5)))
-    factor = normal.factored(0.0)
-    whole = factor.covariance(np.arange(15))
-    band = factor.inverse_band()
-    for d in range(5):
-        np.testing.assert_allclose(band[d, : 12 - d], np.diag(whole, -d)[: 12 - d], rtol=1e-8, atol=1e-10)
-
-
 def test_looks_from_one_place_count_less() -> None:
     """A robot that stands sees the same landmarks with errors that repeat; one that drives does not."""
     world = simulate(replace(PLAN, robots=2, standing=(0,), noise=0.0), 2)
@@ -364,12 +340,9 @@ def test_looks_from_one_place_count_less() -> None:
     assert np.median(drives) < 0.2 * np.median(stands)
 
 
-def test_gyroscopes_replace_the_turns_of_wheels() -> None:
-    """Wheels whose turns are twice the true ones; the gyroscope has a drift that the batch removes."""
+def test_the_drift_of_a_gyroscope_is_found() -> None:
     world = simulate(replace(PLAN, robots=1, noise=0.3), 5)
     recording, swarm = with_sightings(world, 5)
-    rows = recording.odometry
-    pose = rows.pose.copy()
     turns = np.gradient(np.unwrap(world.truth[:, 0, 2]), 1e-9 * world.stamp_ns.astype(float))
     none = np.zeros((turns.size, 3))
     rates = TurnRateRows(
@@ -377,7 +350,7 @@ def test_gyroscopes_replace_the_turns_of_wheels() -> None:
     )
     imu = ImuModel(turn_noise_density=0.002, turn_bias_sigma=0.02, turn_bias_time_s=100.0)
     described = replace(swarm, robots=(replace(swarm.robots[0], imu=imu),))
-    recording = replace(recording, odometry=rows._replace(pose=pose), turn_rates=rates)
+    recording = replace(recording, turn_rates=rates)
     problem = problem_of(recording, described, is_described=True)
     assert problem.drift is not None
     solver = Solver(problem, at_truth(problem, world))

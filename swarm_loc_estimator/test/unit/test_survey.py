@@ -17,9 +17,6 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.batch.problem import SURVEY, problem_of
-from swarm_loc_estimator.offline.batch.solver import Solver
-from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, read_recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.survey.survey import survey
@@ -89,10 +86,7 @@ def test_errors_are_within_the_covariances() -> None:
     squares = []
     for seed in range(6):
         world = simulate(PLAN, seed)
-        x, y, theta = world.truth[0, 0].tolist()
-        robots = (replace(world.swarm.robots[0], start=(x, y, theta)), *world.swarm.robots[1:])
-        robots = (replace(robots[0], start_sigma=StartSigma(1e-3, 1e-3, 1e-3)), *robots[1:])
-        done = survey(recording_of(world), replace(world.swarm, robots=robots, landmarks=()))
+        done = survey(recording_of(world), located_start(world))
         ids = [mark.id for mark in done.problem.swarm.landmarks]
         truth = places_of(world.swarm)
         for index, marker_id in enumerate(ids):
@@ -328,24 +322,6 @@ def test_what_cannot_be_surveyed_is_said_in_a_sentence() -> None:
         survey(replace(recording, detections=NO_DETECTIONS), unplaced(world.swarm))
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
-    world = simulate(PLAN, 1)
-    problem = problem_of(recording_of(world), unplaced(world.swarm), SURVEY)
-    solver = Solver(problem, start_of(problem))
-    solver.solve(lambda _share, _what: None)
-    rng = np.random.default_rng(0)
-    normal, _ = solver._normal(1e6)  # without weights
-    solver._apply(rng.standard_normal(normal.gradient.size) / np.sqrt(normal.diagonal()))  # off the minimum
-    normal, _ = solver._normal(1e6)
-    step = 1e-3 * normal.gradient / normal.diagonal()
-    before, cost = (solver._knot, solver._landmark, solver._parameter), []
-    for sign in (1.0, -1.0):
-        solver._apply(sign * step)
-        cost.append(solver._normal(1e6)[1])
-        solver._knot, solver._landmark, solver._parameter = before
-    assert cost[0] - cost[1] == pytest.approx(-4.0 * normal.gradient @ step, rel=1e-2)
-
-
 def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag, out = BAGS / "eight_five_robots", tmp_path / "surveyed.yaml"
     assert command.main([str(bag), "--all", "--out", str(out)]) == 0
@@ -457,19 +433,3 @@ def test_what_was_measured_rarely_is_named() -> None:
     )
     assert done.swarm.cameras == (CEILING,)
     assert not done.swarm.anchors
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (["bag", "--seconds", "9"], "--seconds and --namespace are for a live graph"),
-        (["bag", "--use-sim-time"], "--use-sim-time is for a live graph"),
-        (["swarm.yaml", "--remap", "a:=b"], "--remap is for bags"),
-        (["swarm.yaml", "--namespace", "a b"], "--namespace 'a b' must be names"),
-    ],
-)
-def test_options_that_do_not_fit_the_source_are_refused(
-    arguments: list[str], problem: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command.main([*arguments, "--out", "surveyed.yaml"]) == 1
-    assert problem in capsys.readouterr().err

@@ -14,7 +14,6 @@ import pytest
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.sweep import main
-from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
@@ -329,25 +328,16 @@ def test_a_fit_without_ground_truth_has_no_best_values(
     assert capsys.readouterr().err == "No trial has position_rmse_m of all its replays.\n"
 
 
-def test_a_fit_without_optuna_is_one_sentence(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    assert run(written(folder, "bags: [short]\n" + FIT)) == 1
-    error = capsys.readouterr().err
-    assert "pip install 'swarm_loc_estimator[optuna]'" in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize("backend", ["ray", "dask"])
+@pytest.mark.parametrize("package", ["ray", "dask", "optuna"])
 def test_a_missing_package_is_one_sentence(
-    folder: Path, backend: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, package: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for module in ("ray", "distributed"):
+    for module in ("ray", "distributed", "optuna"):
         monkeypatch.setitem(sys.modules, module, None)
-    assert run(written(folder, "bags: [short]"), "--backend", backend) == 1
+    fit, more = (FIT, []) if package == "optuna" else ("", ["--backend", package])
+    assert run(written(folder, f"bags: [short]\n{fit}"), *more) == 1
     error = capsys.readouterr().err
-    assert f"pip install 'swarm_loc_estimator[{backend}]'" in error
+    assert f"pip install 'swarm_loc_estimator[{package}]'" in error
     assert error.count("\n") == 1
 
 
@@ -439,7 +429,3 @@ def test_without_truth_the_page_shows_what_the_estimator_reports(tmp_path: Path)
 def test_bands_are_those_of_seeds_alone() -> None:
     found: list[Row] = [{"seed": None, "x": 1.0}, {"seed": 1, "x": 3.0}, {"seed": 2, "x": 7.0}]
     np.testing.assert_array_equal(_span([found, found[:1], []], "x").T, [[2, 3, 4], [1, 1, 1], [np.nan] * 3])
-
-
-def test_errors_of_a_sweep_are_those_of_users() -> None:
-    assert issubclass(SweepFileError, UserError)

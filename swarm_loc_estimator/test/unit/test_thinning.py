@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import concatenate
-from swarm_loc_estimator.nodes.load import Thinning, water_level
+from swarm_loc_estimator.nodes.load import Thinning
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
@@ -105,15 +105,6 @@ def test_of_a_large_swarm_whole_periods_are_left_out_in_whatever_order_they_come
     gaps = np.diff(np.flatnonzero(used))
     assert gaps.max() <= 3.0 / share
     assert thinning.thin(images(0, range(ROBOTS)), 1.0).shed == 0
-
-
-@given(st.lists(st.integers(0, 50), min_size=1), st.floats(0.0, 1.0))
-def test_everyone_gets_as_much_as_the_level_and_all_together_the_total(
-    count: list[int], share: float
-) -> None:
-    total = share * sum(count)
-    level = water_level(np.array(count), total)
-    assert sum(min(one, level) for one in count) == pytest.approx(total, abs=1e-6)
 
 
 def test_all_matrices_of_an_exchange_share_its_fate() -> None:

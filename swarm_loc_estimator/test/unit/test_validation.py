@@ -280,16 +280,6 @@ def test_a_stamp_may_be_ahead_of_the_clock_by_its_tolerance(ahead_ns: int, drops
     assert bool(estimator._tracks.arrays.filled[0]) == (not drops)
 
 
-def test_an_estimator_started_in_the_middle_finds_everybody() -> None:
-    """As after a crash: no start pose is true any more, so none is given."""
-    run = simulate(Plan(3, 8.0, start_known=(False,)), 4)
-    late = [arrival for arrival in on_time(run) if arrival[0] > END]
-    end_ns = T0 + 8 * SECOND
-    last = play(Estimator(run.swarm), late, ticks(END, end_ns))[-1]
-    assert (last.status == Status.TRACKED).all()
-    assert np.linalg.norm(last.poses[:, :2] - run.at(end_ns)[:, :2], axis=1).max() < 0.06
-
-
 def test_memory_stays_bounded_over_a_long_run() -> None:
     run = world()
     estimator = Estimator(run.swarm)

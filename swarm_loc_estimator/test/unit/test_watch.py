@@ -25,8 +25,8 @@ from processor_wait import THIS_THREAD, waited_s
 from ruamel.yaml import YAML
 
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.cdr import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED, CdrError
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED, CdrError, encode
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.identification.memory import Identities
@@ -489,22 +489,12 @@ SWARM = Swarm(robots=(Robot("a", start=(0.0, 0.0, 0.0)), Robot("b", start=(1.0, 
 def grid_bytes(
     cells: np.ndarray[Any, np.dtype[np.int8]], stamp_ns: int = 0, frame: str = "map", resolution: float = 0.5
 ) -> bytes:
-    """A serialized map, by the type store."""
-    types = typestore().types
-    time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
-    origin = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](x=-1.0, y=2.0, z=0.0),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(0.1), w=np.cos(0.1)),
-    )
+    """A serialized map."""
     height, width = cells.shape
-    message = types[OCCUPANCY_GRID](
-        header=types["std_msgs/msg/Header"](stamp=time, frame_id=frame),
-        info=types["nav_msgs/msg/MapMetaData"](
-            map_load_time=time, resolution=resolution, width=width, height=height, origin=origin
-        ),
-        data=cells.reshape(-1),
-    )
-    return bytes(typestore().serialize_cdr(message, OCCUPANCY_GRID))
+    origin = {"position": {"x": -1.0, "y": 2.0}, "orientation": {"z": np.sin(0.1), "w": np.cos(0.1)}}
+    info = {"resolution": resolution, "width": width, "height": height, "origin": origin}
+    message = {"header": {"stamp": stamp_ns, "frame_id": frame}, "info": info, "data": cells.reshape(-1)}
+    return encode(message, OCCUPANCY_GRID)
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.text("abé/", max_size=7), st.integers(0, 2**31 * SECOND - 1))

@@ -3,25 +3,19 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.detections import encode_brightness
-from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.sensors.fix import FixRows
 from swarm_loc_estimator.sensors.infrared import BrightnessRows
-from swarm_loc_estimator.sensors.inputs import Batch, kinds
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -41,8 +35,6 @@ WALK = OdometryModel(
     turn_rate_change=0.02,
 )
 """Of a robot that walks as it is told to, more or less."""
-
-KINDS = kinds()
 
 
 @dataclass(frozen=True)
@@ -263,30 +255,3 @@ def play(
         begin = end
         estimates.append(estimator.tick(now_ns))
     return estimator, estimates
-
-
-def write_bag(run: Run, folder: Path, arrivals: Sequence[tuple[int, Event]]) -> Path:
-    """A bag of messages with their arrivals, its swarm description beside them."""
-    with BagWriter(folder) as writer:
-        for robot in run.swarm.robots:
-            for kind in (KINDS["odometry"], KINDS["brightness"], KINDS["fixes"]):
-                writer.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)
-        for log_ns, event in sorted(arrivals, key=lambda pair: pair[0]):
-            kind, data = encoded(event, run.swarm.robots[event.robot].name)
-            writer.write(f"{run.swarm.robots[event.robot].name}/{kind.topic}", log_ns, data)
-    save_swarm(run.swarm, folder / "swarm.yaml")
-    return folder
-
-
-def encoded(event: Event, name: str) -> tuple[InputKind, bytes]:
-    """The message of an event of a robot."""
-    if isinstance(event, Move):
-        unknown, frames = np.zeros((6, 6)), (f"{name}/odom", f"{name}/base_link")
-        stamp_ns, still = column([event.stamp_ns]), np.zeros((1, 3))
-        data = encode_odometry(*frames, stamp_ns, event.pose[None], still, unknown, unknown)
-        return KINDS["odometry"], data[0]
-    if isinstance(event, Place):
-        return KINDS["fixes"], encode_fix("map", event.stamp_ns, event.pose, np.diag(FIX_SIGMA**2))
-    pair = (event.robot + 1, event.transmitter + 1)
-    frame = f"{name}/base_link"
-    return KINDS["brightness"], encode_brightness(frame, event.stamp_ns, pair, event.readings, event.power)

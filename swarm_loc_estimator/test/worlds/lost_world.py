@@ -69,23 +69,26 @@ class LostRobot:
         """The status of the robot in /diagnostics."""
         estimator, now_ns = self.estimator, self.now_ns
         swarm = estimator.swarm
-        diagnostics = Diagnostics(swarm, Ingest(swarm), EstimatorParameters(), _Alone(), [])
+        diagnostics = Diagnostics(swarm, Ingest(swarm), EstimatorParameters(), Alone(), [])
         losses = [estimator.loss_of(robot) for robot in range(len(swarm.robots))]
         estimate = estimator.tick(now_ns)
         found = diagnostics.reports(now_ns, estimate, estimator.recent(), estimator.drops, losses=losses)
         return found[0]
 
 
-class _Alone:
+@dataclass(frozen=True)
+class Alone:
     """A graph in which nobody publishes."""
+
+    why: str = ""
 
     def duplicate_publishers(self, _topic: str) -> list[str]:
         """None."""
         return []
 
     def why_missing(self, _topic: str, _message_type: str) -> str:
-        """Nothing to say."""
-        return ""
+        """That nobody does."""
+        return self.why
 
 
 def lose(why: LossReason, folder: Path) -> LostRobot:

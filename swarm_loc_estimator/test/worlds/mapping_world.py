@@ -140,6 +140,7 @@ class LidarRobot:
     """
 
     start = np.array([1.7, 0.8, 0.0])
+    has_niche = True  # Whether its room has the niche
 
     def __init__(self, rng: np.random.Generator | None = None) -> None:
         self._rng = rng
@@ -158,7 +159,9 @@ class LidarRobot:
         step = 2.0 * math.pi / BEAMS
         beams = np.stack([np.zeros(BEAMS), np.zeros(BEAMS), step * np.arange(BEAMS)], axis=-1)
         mounted = compose(compose(self.start, self.odometry(beam_ns)), [LIDAR.x, LIDAR.y, LIDAR.yaw])
-        ranges = np.array([distance_in_room(*ray) for ray in compose(mounted, beams).tolist()])
+        ranges = np.array(
+            [distance_in_room(*ray, has_niche=self.has_niche) for ray in compose(mounted, beams).tolist()]
+        )
         if self._rng is not None:
             sigma = LIDAR.range_sigma + LIDAR.range_sigma_per_m * ranges
             ranges += sigma * self._rng.standard_normal(BEAMS)
@@ -173,13 +176,14 @@ def scan_bytes(scan: ScanMessage) -> bytes:
     return encode(fields, LASER_SCAN)
 
 
-def room_map(cell: float) -> OccupancyMap:
+def room_map(cell: float, *, has_niche: bool = True) -> OccupancyMap:
     """The exact map of the room: with cells of 5 cm, its walls are on centres of cells."""
     corner = np.array([-0.325, -0.325])
     count = np.ceil((np.array([ROOM[2], NICHE[3]]) + 0.7) / cell).astype(int)
     x, y = np.meshgrid(*(corner[k] + (np.arange(count[k]) + 0.5) * cell for k in (0, 1)), indexing="ij")
     outside = np.ones(x.shape, dtype=bool)
-    for left, lower, right, upper in (ROOM, (NICHE[0], ROOM[1], *NICHE[2:])):
+    boxes = (ROOM, (NICHE[0], ROOM[1], *NICHE[2:])) if has_niche else (ROOM,)
+    for left, lower, right, upper in boxes:
         inside = (x > left + 1e-6) & (x < right - 1e-6) & (y > lower + 1e-6) & (y < upper - 1e-6)
         outside &= ~inside
     distance = scipy.ndimage.distance_transform_edt(outside)
