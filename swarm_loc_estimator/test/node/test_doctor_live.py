@@ -1,13 +1,12 @@
 """The doctor over DDS: it hears the topics of a live graph, and knows their publishers."""
 
-import threading
 import time
 from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from node_world import Ros, detection_bytes, odometry_bytes, sight
+from node_world import Ros, detection_bytes, odometry_bytes, repeated, sight
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.doctor.doctor import examine
@@ -30,22 +29,15 @@ def test_a_live_graph_is_heard(ros: Ros, swarm_file: Path, namespace: str) -> No
     ros.tester.create_publisher(PoseStamped, f"{prefix}beta/odom", 10)
     ros.tester.create_publisher(Odometry, f"{prefix}beta/wheels", 10)
     listener = Listener(load_swarm(swarm_file), namespace, use_sim_time=False)
-    stop = threading.Event()
 
     def drive() -> None:
-        while not stop.wait(0.05):
-            now_ns = time.time_ns()
-            odometry.publish(odometry_bytes("alpha", now_ns))
-            detections.publish(detection_bytes("alpha", now_ns, sight((0.0, 0.0, 0.0))))
+        now_ns = time.time_ns()
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        detections.publish(detection_bytes("alpha", now_ns, sight((0.0, 0.0, 0.0))))
 
-    driver = threading.Thread(target=drive)
-    driver.start()
-    try:
+    with repeated(drive):
         evidence = listener.listen(4.0, unwatched)
-    finally:
-        stop.set()
-        driver.join()
-        listener.destroy_node()
+    listener.destroy_node()
     assert len(evidence.topics["alpha/odom"].messages) > 20
     assert {one.node for one in evidence.topics["alpha/odom"].publishers} == {"/tester"}
     # on a busy machine messages may really pause
@@ -62,21 +54,14 @@ def test_a_live_graph_is_described(ros: Ros) -> None:
     names = {"alpha": "lab/alpha/odom", "beta": "lab/beta/odom"}
     publishers = {one: ros.tester.create_publisher(Odometry, name, 10) for one, name in names.items()}
     listener = Listener(Swarm(), "", is_proposed_from, use_sim_time=False)
-    stop = threading.Event()
 
     def drive() -> None:
-        while not stop.wait(0.05):
-            for name, publisher in publishers.items():
-                publisher.publish(odometry_bytes(name, time.time_ns()))
+        for name, publisher in publishers.items():
+            publisher.publish(odometry_bytes(name, time.time_ns()))
 
-    driver = threading.Thread(target=drive)
-    driver.start()
-    try:
+    with repeated(drive):
         evidence = listener.listen(3.0, unwatched)
-    finally:
-        stop.set()
-        driver.join()
-        listener.destroy_node()
+    listener.destroy_node()
     found = proposed(evidence.topics, lambda likely: likely)
     assert [robot.name for robot in found.swarm.robots] == [*names]
     assert found.swarm.topics == {"<robot>/odom": "lab/<robot>/odom"}

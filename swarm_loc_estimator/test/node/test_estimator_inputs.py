@@ -1,6 +1,7 @@
 """Inputs of the estimator's node: aerial images, ranges, fixed cameras and the local frame."""
 
 import math
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from node_world import (
     TRUE_POSES,
     Robots,
     Ros,
+    Steps,
     detection_bytes,
-    is_estimated,
     newest_status,
     odometry_bytes,
     overrides,
@@ -35,7 +36,6 @@ from rcl_interfaces.msg import Log
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range as PairRange
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -58,7 +58,6 @@ from swarm_loc_msgs.msg import (
     RangeArray,
     RobotIdentities,
     SwarmPose,
-    SwarmPoses,
 )
 
 SWARM_YAML = """
@@ -79,36 +78,29 @@ class Droplets:
     """The swarm's drivers."""
 
     def __init__(self, ros: Ros) -> None:
-        self._ros = ros
-        self._clock: Publisher = ros.tester.create_publisher(Clock, "/clock", 10)
         self._publisher = {
             topic: ros.tester.create_publisher(KINDS[topic.partition("/")[2]], topic, 100)
             for topic in ("alpha/odom", "alpha/brightness", "gamma/fix")
         }
-        self.poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+        self._steps = Steps(ros, *self._publisher.values())
         self._bright = np.minimum(np.rint(expected_brightness(load_ir_platform("droplet"), BETA)[0]), 255)
-
-    def wait_for_estimator(self) -> None:
-        """Return once it hears all topics and is heard."""
-        inputs = [self._clock, *self._publisher.values()]
-        self._ros.until(lambda: all(publisher.get_subscription_count() for publisher in inputs))
-        self._ros.until(lambda: self._ros.tester.count_publishers("swarm/poses"))
 
     def step(self, now_ns: int, frame: str = "map", transmitter: int = 2) -> None:
         """What comes in a step; wait for the estimate that follows."""
-        heard = len(self.poses)
-        self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        self._publisher["alpha/odom"].publish(odometry_bytes("alpha", now_ns))
-        for power, readings in enumerate(self._bright):
-            light = encode_brightness("alpha/base_link", now_ns, (1, transmitter), readings, power)
-            self._publisher["alpha/brightness"].publish(light)
-        covariance = np.diag([1e-6, 1e-6, 1e-4])
-        self._publisher["gamma/fix"].publish(encode_fix(frame, now_ns, GAMMA, covariance))
-        self._ros.until(lambda: any(stamp_ns(pose) == now_ns for pose in self.poses[heard:]))
+        lights = [
+            encode_brightness("alpha/base_link", now_ns, (1, transmitter), readings, power)
+            for power, readings in enumerate(self._bright)
+        ]
+        self._steps.step(
+            now_ns,
+            (self._publisher["alpha/odom"], odometry_bytes("alpha", now_ns)),
+            *((self._publisher["alpha/brightness"], light) for light in lights),
+            (self._publisher["gamma/fix"], encode_fix(frame, now_ns, GAMMA, np.diag([1e-6, 1e-6, 1e-4]))),
+        )
 
     def newest(self, robot: str) -> SwarmPose:
         """The last estimate of a robot."""
-        (pose,) = [pose for pose in self.poses[-1].robots if pose.name == robot]
+        (pose,) = [pose for pose in self._steps.poses[-1].robots if pose.name == robot]
         return pose
 
 
@@ -119,9 +111,7 @@ def droplets(ros: Ros, tmp_path: Path) -> Droplets:
     path.write_text(SWARM_YAML, encoding="utf-8")
     parameters = overrides(swarm_file=str(path), use_sim_time=True, fusion_load=1.0)
     ros.add(EstimatorNode(parameter_overrides=parameters))
-    droplets = Droplets(ros)
-    droplets.wait_for_estimator()
-    return droplets
+    return Droplets(ros)
 
 
 def until_told(ros: Ros, heard: list[DiagnosticArray], now_ns: int) -> None:
@@ -214,7 +204,6 @@ cameras:
   ceiling1: {x: 1.0, y: 0.5, z: 2.1}
   ceiling2: {x: 3.0, y: 0.5, z: 2.1}
 """
-STEP_NS_FIXED_CAMERAS_NODE = SECOND // 10
 
 
 def below(marker_id: int) -> Any:
@@ -237,28 +226,17 @@ def estimator(ros: Ros, tmp_path: Path) -> EstimatorNode:
 
 
 def test_detections_of_a_fixed_camera_locate_a_robot(ros: Ros, estimator: EstimatorNode) -> None:
-    tester = ros.tester
-    clock = tester.create_publisher(Clock, "/clock", 10)
-    odometry = tester.create_publisher(Odometry, "alpha/odom", 100)
-    detections = tester.create_publisher(MarkerDetectionArray, "ceiling1/detections", 100)
-    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    detections = ros.tester.create_publisher(MarkerDetectionArray, "ceiling1/detections", 100)
     diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
-    publishers = (clock, odometry, detections)
-    ros.until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
-    ros.until(lambda: tester.count_publishers("swarm/poses") and tester.count_publishers("/diagnostics"))
-    (topic,) = tester.get_subscriptions_info_by_topic("/ceiling2/detections")
+    steps = Steps(ros, odometry, detections)
+    (topic,) = ros.tester.get_subscriptions_info_by_topic("/ceiling2/detections")
     assert topic.node_name == estimator.get_name()
-
-    def step(now_ns: int) -> None:
-        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        odometry.publish(odometry_bytes("alpha", now_ns))
-        for marker_id in (4, 99):
-            detections.publish(detection_bytes("ceiling1", now_ns, below(marker_id)))
-        ros.until(lambda: any(stamp_ns(one) == now_ns for one in poses))
-
     for k in range(30):
-        step(T0_NS + k * STEP_NS_FIXED_CAMERAS_NODE)
-    (alpha,) = poses[-1].robots
+        now_ns = T0_NS + k * SECOND // 10
+        seen = [(detections, detection_bytes("ceiling1", now_ns, below(marker_id))) for marker_id in (4, 99)]
+        steps.step(now_ns, (odometry, odometry_bytes("alpha", now_ns)), *seen)
+    (alpha,) = steps.poses[-1].robots
     assert alpha.status == SwarmPose.STATUS_TRACKED
     assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((1.0, 0.7, 0.0), abs=2e-3)
     ros.until(lambda: "dropped: unknown_id" in values_of(newest_status(diagnostics, "estimator: ceiling1")))
@@ -322,6 +300,24 @@ anchors:
 )
 
 
+def after_ranges(
+    ros: Ros, odometry: Publisher, ranges: Sequence[tuple[Publisher, Callable[..., Any]]]
+) -> list[DiagnosticArray]:
+    """Send ranges of four seconds, after which alpha is where it is; returns the diagnostics."""
+    heard: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+    steps = Steps(ros, odometry, *(publisher for publisher, _ in ranges))
+    for step in range(8):
+        now_ns = T0_NS + step * SECOND // 2
+        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
+        messages = [(publisher, message(header=header)) for publisher, message in ranges]
+        steps.step(now_ns, (odometry, odometry_bytes("alpha", now_ns)), *messages)
+    until_told(ros, heard, now_ns)
+    (alpha,) = steps.poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    return heard
+
+
 @pytest.mark.parametrize(
     "topics",
     [
@@ -336,26 +332,11 @@ def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]
     named = "" if topics["ranges"] == "alpha/ranges" else of_others
     path.write_text(f"{SWARM_YAML_RANGES_LIVE}{named}\n", encoding="utf-8")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
-    clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = ros.tester.create_publisher(Odometry, topics["odom"], 100)
     ranges = ros.tester.create_publisher(RangeArray, topics["ranges"], 100)
-    poses = ros.listen(SwarmPoses, "swarm/poses")
-    heard = ros.listen(DiagnosticArray, "/diagnostics")
-    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, ranges)))
-    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
     measured = [Range(device=a, range=float(np.hypot(np.hypot(x, y), 1.0))) for a, (x, y) in ANCHORS.items()]
-    for step in range(8):
-        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
-        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        odometry.publish(odometry_bytes("alpha", now_ns))
-        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
-        ranges.publish(RangeArray(header=header, ranges=[*measured, Range(device=99, range=1.0)]))
-        ros.until(partial(is_estimated, poses, before, now_ns))
-    ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
-
-    (alpha,) = poses[-1].robots
-    assert alpha.status == SwarmPose.STATUS_TRACKED
-    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    measured.append(Range(device=99, range=1.0))
+    heard = after_ranges(ros, odometry, [(ranges, partial(RangeArray, ranges=measured))])
     assert values_of(newest_status(heard, "estimator: alpha"))["ranges received"] == "8"
     assert values_of(newest_status(heard, "estimator"))["dropped: uwb_unknown_address"] == "8"
 
@@ -368,27 +349,15 @@ def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> 
     )
     path.write_text(f"{named}range_topic: /uwb/n_{{from}}/n_{{to}}/distance\n", encoding="utf-8")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
-    clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
     names = {16: "uwb/n_tag/n_west/distance", 17: "uwb/n_17/n_tag/distance", 18: "uwb/n_tag/n_18/distance"}
-    ranges = {a: ros.tester.create_publisher(PairRange, name, 10) for a, name in names.items()}
-    poses = ros.listen(SwarmPoses, "swarm/poses")
-    heard = ros.listen(DiagnosticArray, "/diagnostics")
-    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, *ranges.values())))
-    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
-    for step in range(8):
-        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
-        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        odometry.publish(odometry_bytes("alpha", now_ns))
-        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
-        for a, (x, y) in ANCHORS.items():
-            ranges[a].publish(PairRange(header=header, range=float(np.hypot(np.hypot(x, y), 1.0))))
-        ros.until(partial(is_estimated, poses, before, now_ns))
-    ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
-
-    (alpha,) = poses[-1].robots
-    assert alpha.status == SwarmPose.STATUS_TRACKED
-    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    measured: list[tuple[Publisher, Callable[..., Any]]] = []
+    for a, (x, y) in ANCHORS.items():
+        away = float(np.hypot(np.hypot(x, y), 1.0))
+        measured.append(
+            (ros.tester.create_publisher(PairRange, names[a], 10), partial(PairRange, range=away))
+        )
+    heard = after_ranges(ros, odometry, measured)
     assert values_of(newest_status(heard, "estimator: alpha"))["measurements used"] == "24"
 
 

@@ -1,6 +1,5 @@
 """More comes over DDS than an estimator can use: it leaves sightings out, says so, and stays right."""
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
-from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
+from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, repeated, sight
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.sensors.inputs import Batch
@@ -18,7 +17,6 @@ from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
-PERIOD_S = 0.05
 COST_S = 0.03  # Sixteen sightings come in a tick of 200 ms: they would take 480 ms
 
 
@@ -50,7 +48,7 @@ class SlowEstimator(Estimator):
 @contextmanager
 def driving(ros: Ros) -> Iterator[list[int]]:
     """Robots that send odometry and an image 20 times a second, from a process of their own; how often."""
-    node, sent, end = ros.stranger(), [0], threading.Event()
+    node, sent = ros.stranger(), [0]
     odometry = {name: node.create_publisher(Odometry, f"{name}/odom", 1000) for name in TRUE_POSES}
     images = {
         name: node.create_publisher(MarkerDetectionArray, f"{name}/detections", 1000) for name in TRUE_POSES
@@ -59,20 +57,14 @@ def driving(ros: Ros) -> Iterator[list[int]]:
     ros.until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
 
     def send() -> None:
-        while not end.wait(PERIOD_S):
-            for name, pose in TRUE_POSES.items():
-                stamp_ns = time.time_ns()
-                odometry[name].publish(odometry_bytes(name, stamp_ns))
-                images[name].publish(detection_bytes(name, stamp_ns, sight(pose)))
-            sent[0] += 1
+        for name, pose in TRUE_POSES.items():
+            stamp_ns = time.time_ns()
+            odometry[name].publish(odometry_bytes(name, stamp_ns))
+            images[name].publish(detection_bytes(name, stamp_ns, sight(pose)))
+        sent[0] += 1
 
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
+    with repeated(send):
         yield sent
-    finally:
-        end.set()
-        thread.join()
 
 
 def newest(heard: list[DiagnosticArray]) -> tuple[int, str, dict[str, str]]:

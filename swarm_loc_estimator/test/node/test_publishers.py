@@ -24,6 +24,7 @@ from node_world import (
     Program,
     Robots,
     Ros,
+    Steps,
     newest_status,
     odometry_bytes,
     overrides,
@@ -36,14 +37,13 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
 from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_msgs.msg import SwarmDetections, SwarmOdometry, SwarmPoses
+from swarm_loc_msgs.msg import SwarmDetections, SwarmOdometry
 from workspace.layout import PACKAGES, ROOT
 
 FLOOD = """
@@ -246,23 +246,20 @@ def test_robots_are_located_by_topics_that_they_share(ros: Ros, swarm_file: Path
     parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, shared_topics=True, **SETTINGS)
     node = ros.add(EstimatorNode(parameter_overrides=parameters))
     heard = ros.listen(DiagnosticArray, "/diagnostics")
-    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
-    clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = [ros.tester.create_publisher(SwarmOdometry, "swarm/odom", 10) for _ in TRUE_POSES]
     seen = ros.tester.create_publisher(SwarmDetections, "swarm/detections", 10)
-    ros.until(lambda: all(one.get_subscription_count() for one in (clock, *odometry, seen)))
-    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    steps = Steps(ros, *odometry, seen)
     for step in range(30):
         now_ns = T0_NS + step * STEP_NS
-        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        for robot, gateway in enumerate(odometry):
-            gateway.publish(encode_shared_numbers(head([robot], now_ns), np.zeros((2, 3))))
+        moved = [
+            (gateway, encode_shared_numbers(head([robot], now_ns), np.zeros((2, 3))))
+            for robot, gateway in enumerate(odometry)
+        ]
         images = [sight(pose) for pose in TRUE_POSES.values()]
         robots = np.repeat(range(len(images)), [len(image) for image in images]).tolist()
         markers = np.concatenate([*images, images[0][:1]], dtype=images[0].dtype)
-        seen.publish(encode_shared_detections(head(robots, now_ns), markers))
-        ros.until(lambda now_ns=now_ns: bool(poses) and stamp_ns(poses[-1]) == now_ns)  # type: ignore[misc]
-    for pose in poses[-1].robots:
+        steps.step(now_ns, *moved, (seen, encode_shared_detections(head(robots, now_ns), markers)))
+    for pose in steps.poses[-1].robots:
         assert (pose.x, pose.y, pose.theta) == pytest.approx(TRUE_POSES[pose.name], abs=0.02)
         assert pose.status == pose.STATUS_TRACKED
 

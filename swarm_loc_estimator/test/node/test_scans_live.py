@@ -2,23 +2,22 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped
 from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry
-from node_world import SECOND, T0_NS, Ros, is_estimated, odometry_bytes, overrides
+from node_world import SECOND, T0_NS, Ros, Steps, odometry_bytes, overrides
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
+from swarm_loc_msgs.msg import SwarmPose
 
 BEAMS = 180
 SWARM_YAML = """
@@ -68,27 +67,21 @@ def stand_while_scans_come(
     path.write_text(SWARM_YAML, encoding="utf-8")
     write_map(tmp_path)
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
-    clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
     scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
-    publishers = [clock, odometry, scans]
+    publishers = [odometry, scans]
     if static is not None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         publishers.append(ros.tester.create_publisher(TFMessage, "/tf_static", latched))
         publishers[-1].publish(TFMessage(transforms=[static]))
-    poses = ros.listen(SwarmPoses, "swarm/poses")
-    ros.until(lambda: all(one.get_subscription_count() for one in publishers))
-    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    steps = Steps(ros, *publishers)
     for step in range(10):
-        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
-        odometry.publish(odometry_bytes("alpha", now_ns))
+        now_ns = T0_NS + step * SECOND // 2
         scan = scan_at(now_ns)
         scan.ranges = [*scan.ranges[turned_by:], *scan.ranges[:turned_by]]
-        scans.publish(scan)
-        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        ros.until(partial(is_estimated, poses, before, now_ns))
+        steps.step(now_ns, (odometry, odometry_bytes("alpha", now_ns)), (scans, scan))
 
-    (alpha,) = poses[-1].robots
+    (alpha,) = steps.poses[-1].robots
     assert alpha.status == SwarmPose.STATUS_TRACKED
     assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
 
@@ -121,23 +114,17 @@ def test_a_map_by_topic_is_used_and_changed_at_run_time(ros: Ros, tmp_path: Path
     maps = ros.tester.create_publisher(OccupancyGrid, "map", latched)
     maps.publish(grid())
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
-    clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
     scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
-    poses, diagnostics = ros.listen(SwarmPoses, "swarm/poses"), ros.listen(DiagnosticArray, "/diagnostics")
-    ros.until(lambda: all(one.get_subscription_count() for one in (maps, clock, odometry, scans)))
-    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
-    steps = iter(range(1000))
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    steps, times = Steps(ros, maps, odometry, scans), count(T0_NS, SECOND // 2)
 
     def send_until(happened: Callable[[SwarmPose], bool]) -> SwarmPose:
         """Send data until something has happened; returns alpha."""
         for _ in range(1000):
-            now_ns, before = T0_NS + next(steps) * SECOND // 2, len(poses)
-            odometry.publish(odometry_bytes("alpha", now_ns))
-            scans.publish(scan_at(now_ns))
-            clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-            ros.until(partial(is_estimated, poses, before, now_ns))
-            alpha: SwarmPose = poses[-1].robots[0]
+            now_ns = next(times)
+            steps.step(now_ns, (odometry, odometry_bytes("alpha", now_ns)), (scans, scan_at(now_ns)))
+            alpha: SwarmPose = steps.poses[-1].robots[0]
             if happened(alpha):
                 return alpha
         raise AssertionError(alpha)

@@ -99,11 +99,7 @@ def test_robots_that_do_not_move_get_no_answer_and_its_reason() -> None:
     carried=st.booleans(),
 )
 def test_any_lateness_loss_and_repetition_gives_the_same(
-    seed: int,
-    start_known: Sequence[bool],
-    headings: bool,
-    late_s: float,
-    carried: bool,
+    seed: int, start_known: Sequence[bool], headings: bool, late_s: float, carried: bool
 ) -> None:
     rng = np.random.default_rng(seed)
     plan = Plan(3, 7.0, 0.2, start_known=start_known, carried=(0,) if carried else ())

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from core_messages import odometry_bytes
 from wrong_setups import (
     BAGS,
     BOTH,
@@ -29,7 +30,7 @@ from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.cli import survey
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.doctor.contents import IMAGE
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message
@@ -170,10 +171,8 @@ def test_exchanged_bodies_are_named_whatever_topics_are_missing(tmp_path: Path) 
         for k in range(200):
             stamp_ns = k * 100_000_000
             for index, robot in enumerate(robots):
-                pose = np.array([[0.01 * k, 0.0, 0.0]])
-                odometry = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-                frames = f"{robot.name}/odom", f"{robot.name}/base_link"
-                bag.write(f"{robot.name}/odom", stamp_ns, encode_odometry(*frames, *odometry)[0])
+                odometry = odometry_bytes(robot.name, stamp_ns, (0.01 * k, 0.0, 0.0))
+                bag.write(f"{robot.name}/odom", stamp_ns, odometry)
                 seen = np.array([0.01 * k, float(index != (k >= 100)), 0.0])
                 fix = encode_fix("map", stamp_ns, seen, np.diag(np.square([0.01, 0.01, 0.02])))
                 bag.write(f"{robot.name}/fix", stamp_ns, fix)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from core_messages import odometry_bytes
 
 from swarm_loc_estimator.common.messages.cdr import RANGE, encode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
-from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import SCAN
@@ -47,55 +47,33 @@ class World:
         self.diagnostics = Diagnostics(swarm, self.ingest, parameters, self.graph, ["swarm/poses"])
         self.reports = self.diagnostics.reports
 
+    def _read(self, topic: str, data: bytes, now_ns: int) -> None:
+        list(
+            self.ingest.read(MessageBatch.of([SerializedMessage(self.ingest.handle_of[topic], data, now_ns)]))
+        )
+
     def detections(self, now_ns: int) -> None:
         """A picture of robot a without any marker."""
         data = encode_detections("a/camera_optical_frame", now_ns, np.zeros(0, DETECTION_DTYPE))
-        list(
-            self.ingest.read(
-                MessageBatch.of([SerializedMessage(self.ingest.handle_of["a/detections"], data, now_ns)])
-            )
-        )
+        self._read("a/detections", data, now_ns)
 
     def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
         """One message."""
-        (data,) = encode_odometry(
-            frame or f"{robot}/odom",
-            "base",
-            np.array([stamp_ns]),
-            np.zeros((1, 3)),
-            np.zeros((1, 3)),
-            np.eye(6),
-            np.eye(6),
-        )
-        list(
-            self.ingest.read(
-                MessageBatch.of([SerializedMessage(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])
-            )
-        )
+        self._read(f"{robot}/odom", odometry_bytes(robot, stamp_ns, frame=frame), now_ns)
 
 
 def estimate(now_ns: int, *status: Status) -> Estimate:
-    n = len(status)
-    return Estimate(
-        now_ns,
-        np.zeros((n, 3)),
-        np.tile(4.0 * np.eye(3), (n, 1, 1)),
-        np.zeros((n, 3)),
-        np.array(status, np.uint8),
-        np.zeros(n),
-        np.ones(n, bool),
-    )
+    n, code = len(status), np.array(status, np.uint8)
+    poses, covariances = np.zeros((n, 3)), np.tile(4.0 * np.eye(3), (n, 1, 1))
+    return Estimate(now_ns, poses, covariances, poses, code, np.zeros(n), np.ones(n, bool))
 
 
 def recent(*rows: tuple[int, Verdict, float]) -> Recent:
     """Measurements: who sent it, what was thought of it, its NIS."""
     measurements = Measurements.empty(len(rows))
     measurements.received_from[:] = [row[0] for row in rows]
-    return (
-        measurements,
-        np.array([row[1] for row in rows], np.uint8),
-        np.array([row[2] for row in rows], dtype=float),
-    )
+    verdicts, nis = [row[1] for row in rows], [row[2] for row in rows]
+    return measurements, np.array(verdicts, np.uint8), np.array(nis, dtype=float)
 
 
 def test_missing_topics_are_grouped_by_cause() -> None:

@@ -256,10 +256,7 @@ def test_what_fails_inside_is_passed_on_and_leaves_nothing(tmp_path: Path) -> No
     ],
 )
 def test_a_full_disk_is_found_before_the_work_begins(
-    main: Callable[[list[str]], int],
-    more: list[str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    main: Callable[[list[str]], int], more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = [one.replace("FOLDER", str(tmp_path)) for one in more]
     with full_after(100_000), pytest.raises(SystemExit):

@@ -8,12 +8,7 @@ from ir_world import droplet, droplet_matrix, nees, pair_of, pose_errors, random
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
-from swarm_loc_estimator.infrared.cost import (
-    CostWorkspace,
-    Pair,
-    cost_of,
-    new_cost_workspace,
-)
+from swarm_loc_estimator.infrared.cost import CostWorkspace, Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrGains, IrModel, PairGains, load_ir_platform

@@ -9,11 +9,7 @@ import pytest
 from ir_world import ANGLES, droplet, emitter_20, far_21, sensor_19
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import (
-    amplitude_at,
-    curve_at,
-    distance_at,
-)
+from swarm_loc_estimator.infrared.brightness import amplitude_at, curve_at, distance_at
 from swarm_loc_estimator.swarm.ir_board import (
     PACKAGED,
     Amplitude,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import wrapped
+from core_messages import odometry_bytes
 from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes, static
 from numpy.typing import NDArray
 
@@ -16,7 +17,6 @@ from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY, TRANSFORMS
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import between, compose, transform_points
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
@@ -33,17 +33,11 @@ TURTLE = Robot(
 )
 
 
-def odometry(stamp_ns: int, pose: FloatArray) -> bytes:
-    unknown = UNKNOWN_COVARIANCE
-    stamps, zero = np.array([stamp_ns]), np.zeros((1, 3))
-    return encode_odometry("a/odom", "a/base_link", stamps, pose[None], zero, unknown, unknown)[0]
-
-
 def messages(until_ns: int, seed: int) -> list[tuple[MapperInput, int, bytes]]:
     """What the robot sends: odometry, and each sweep when it is over."""
     robot = LidarRobot(np.random.default_rng(seed))
     sent = [
-        (MapperInput.ODOMETRY, at_ns, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+        (MapperInput.ODOMETRY, at_ns, odometry_bytes("a", at_ns, robot.odometry(np.array([at_ns]))[0]))
         for at_ns in range(0, until_ns + 1, ODOMETRY_NS)
     ]
     sweeps = range(0, until_ns - SWEEP_NS + 1, SWEEP_NS)
@@ -206,7 +200,7 @@ def test_the_mapper_finds_that_scans_are_stamped_late(late_ns: int, seed: int) -
     mapper, robot = CooperativeMapper(), Wanderer(np.random.default_rng(seed))
     feed = MapperFeed([TURTLE], mapper, {})
     for at_ns in range(0, 25_000_000_000, ODOMETRY_NS):
-        feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+        feed.add(0, MapperInput.ODOMETRY, odometry_bytes("a", at_ns, robot.odometry(np.array([at_ns]))[0]))
         if at_ns % SWEEP_NS == 0 and at_ns >= SWEEP_NS:
             scan = robot.scan(at_ns - late_ns)._replace(stamp_ns=at_ns)
             feed.add(0, MapperInput.SCAN, scan_bytes(scan))
@@ -247,7 +241,7 @@ def test_a_robot_that_stands_adds_one_sweep() -> None:
     feed = MapperFeed([TURTLE], mapper, {})
     scan = robot.scan(0)._replace(time_increment=0.0)
     for k in range(20):
-        feed.add(0, MapperInput.ODOMETRY, odometry(k * SWEEP_NS, np.zeros(3)))
+        feed.add(0, MapperInput.ODOMETRY, odometry_bytes("a", k * SWEEP_NS, np.zeros(3)))
         feed.add(0, MapperInput.SCAN, scan_bytes(scan._replace(stamp_ns=k * SWEEP_NS)))
     assert mapper.graph.count == mapper.counters["scans"] == 1
 
@@ -258,7 +252,7 @@ def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
     for at_ns in range(0, 8_000_000_000, ODOMETRY_NS):
         pose = robot.odometry(np.array([at_ns]))[0]
         shift = [3.0, 0.0, 1.0] if at_ns >= 4_000_000_000 else np.zeros(3)
-        feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, compose(shift, pose)))
+        feed.add(0, MapperInput.ODOMETRY, odometry_bytes("a", at_ns, compose(shift, pose)))
         if at_ns % SWEEP_NS == 0:
             feed.add(0, MapperInput.SCAN, scan_bytes(robot.scan(at_ns)))
     assert mapper.counters["odometry_restarts"] == 1
@@ -278,8 +272,10 @@ def test_other_robots_are_no_walls_of_the_map(start_error: float, seed: int) -> 
         feed = MapperFeed([replace(TURTLE, lidar=lidar), standing], mapper, {})
         robot, still = LidarRobot(rng), LidarRobot(rng)
         for at_ns in range(0, 12_000_000_000, ODOMETRY_NS):
-            feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
-            feed.add(1, MapperInput.ODOMETRY, odometry(at_ns, np.zeros(3)))
+            feed.add(
+                0, MapperInput.ODOMETRY, odometry_bytes("a", at_ns, robot.odometry(np.array([at_ns]))[0])
+            )
+            feed.add(1, MapperInput.ODOMETRY, odometry_bytes("a", at_ns, np.zeros(3)))
             if at_ns % SWEEP_NS == 0:
                 scan, beams = robot.scan(at_ns), np.arange(BEAMS)
                 at = compose(robot.start, robot.odometry(at_ns + SWEEP_NS // BEAMS * beams))

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from core_geometry import nees, wrapped
+from core_messages import odometry_bytes
 from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
@@ -58,12 +58,10 @@ def sent(
     change: Callable[[ScanMessage], ScanMessage] = lambda scan: scan,
 ) -> list[tuple[str, int, bytes]]:
     """Topic, arrival and bytes: odometry, and each sweep when it is over, with some beams at people."""
-    robot, unknown = kind(np.random.default_rng(seed)), UNKNOWN_COVARIANCE
+    robot = kind(np.random.default_rng(seed))
     found = []
     for at_ns in range(0, until_ns + 1, ODOMETRY_NS):
-        pose = robot.odometry(np.array([at_ns]))
-        frames = ("a/odom", "a/base_link")
-        data = encode_odometry(*frames, np.array([at_ns]), pose, np.zeros((1, 3)), unknown, unknown)[0]
+        data = odometry_bytes("a", at_ns, robot.odometry(np.array([at_ns])))
         found.append(("a/odom", at_ns, data))
     for k, at_ns in enumerate(range(0, until_ns - SWEEP_NS + 1, SWEEP_NS)):
         scan = robot.scan(at_ns)
@@ -235,14 +233,13 @@ def test_a_scan_with_many_people_does_not_confirm_a_start(room: Path) -> None:
 
 def test_a_robot_that_is_carried_away_is_contradicted_and_then_lost(room: Path) -> None:
     """Its odometry has not noticed: scans of another place come from a robot that was at home before."""
-    until_ns, home, unknown = 8_000_000_000, LidarRobot(), UNKNOWN_COVARIANCE
+    until_ns, home = 8_000_000_000, LidarRobot()
     estimator, names = Estimator(swarm_at(room, home.start)), set()
     assert hand_in(estimator, sent(until_ns, seed=1))[-1].status[0] == Status.TRACKED
     stands, elsewhere = home.odometry(np.array([until_ns])), home.scan(until_ns // 2)
     status = []
     for at_ns in range(until_ns + SWEEP_NS, until_ns + 13 * SWEEP_NS, SWEEP_NS):
-        frames, stamps = ("a/odom", "a/base_link"), np.array([at_ns])
-        odometry = encode_odometry(*frames, stamps, stands, np.zeros((1, 3)), unknown, unknown)[0]
+        odometry = odometry_bytes("a", at_ns, stands)
         scan = scan_bytes(elsewhere._replace(stamp_ns=at_ns - SWEEP_NS))
         status += hand_in(estimator, [("a/odom", at_ns, odometry), ("a/scan", at_ns, scan)])
         names |= {(one.about, one.kind) for one in estimator.contradictions(at_ns)}

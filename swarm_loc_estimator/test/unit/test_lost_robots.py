@@ -19,6 +19,7 @@ from core_messages import (
     batch_of,
     detection,
     give_fix,
+    odometry_bytes,
     quaternion,
 )
 from core_run import on_time, play, ticks
@@ -32,7 +33,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.health import Level
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import LossReason, select
 from swarm_loc_estimator.filter.models import CARTESIAN
@@ -96,8 +97,7 @@ def test_replay_lists_all_losses_of_a_robot_that_is_located_again(tmp_path: Path
         bag.add_topic("a/fix", POSE_WITH_COVARIANCE)
         for k in range(60):
             stamp_ns = k * 500_000_000
-            odometry = np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-            bag.write("a/odom", stamp_ns, encode_odometry("a/odom", "a/base_link", *odometry)[0])
+            bag.write("a/odom", stamp_ns, odometry_bytes("a", stamp_ns))
             pose = np.add(HOME, (1.0 if 10 <= k < 30 else 0.0, 0.0, 0.0))
             bag.write("a/fix", stamp_ns, encode_fix("map", stamp_ns, pose, FIX_COVARIANCE))
     result = replay(tmp_path / "bag", FIXED)

@@ -7,12 +7,14 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+from core_messages import odometry_bytes
 
 from swarm_loc_estimator.cli.new import main
 from swarm_loc_estimator.cli.replay import main as replay_main
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import (
+    LASER_SCAN,
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
@@ -20,7 +22,7 @@ from swarm_loc_estimator.common.messages.cdr import (
     TRANSFORMS,
     encode,
 )
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.doctor.proposal import Proposal, heard_in, proposed
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.offline.replay import replay
@@ -120,10 +122,8 @@ def lab(bag: Path, *, apart_s: float = 0.0, before_iron: bool = False) -> Mappin
             stamp_ns = 1_000_000_000_000 + k * 50_000_000
             at_ns = stamp_ns + round(apart_s * 1e9) + 5_000_000
             for name, track in tracks.items():
-                pose = se2.between(track[0], track[k])[None]
-                frames = "odom", "base_link"
-                row = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-                writer.write(f"{name}/odom", at_ns, encode_odometry(*frames, *row)[0])
+                pose = se2.between(track[0], track[k])
+                writer.write(f"{name}/odom", at_ns, odometry_bytes(name, stamp_ns, pose, "odom"))
                 body = se2.compose(track[k], [0.0, 0.0, TURNED if name == NAMES[0] else 0.0])
                 topic = f"vrpn/robot{int(name[-2:])}_cap/pose"
                 writer.write(topic, at_ns, encode_pose_stamped("world", np.array([stamp_ns]), body[None])[0])
@@ -176,10 +176,9 @@ def test_what_nothing_shows_is_asked(tmp_path: Path) -> None:
         writer.add_topic("uwb/1/2", RANGE)
         for k in range(100):
             at_ns = 1_000_000_000_000 + k * 50_000_000
-            pose = np.array([[0.01 * k, 0.0, 0.0]])
-            for name, stamp_ns in (("r1/odom", at_ns), ("r2/odom", 0)):
-                row = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-                writer.write(name, at_ns, encode_odometry("odom", "base_link", *row)[0])
+            for name, stamp_ns in (("r1", at_ns), ("r2", 0)):
+                data = odometry_bytes(name, stamp_ns, (0.01 * k, 0.0, 0.0), "odom")
+                writer.write(f"{name}/odom", at_ns, data)
             fields = {"header": {"stamp": at_ns}, "max_range": 50.0, "range": 2.0}
             writer.write("uwb/1/2", at_ns, encode(fields, RANGE))
     asked = "\n".join(proposal(tmp_path / "bag").asked)
@@ -194,7 +193,6 @@ def test_what_nothing_shows_is_asked(tmp_path: Path) -> None:
 def test_mounts_are_those_of_static_transforms(tmp_path: Path) -> None:
     """One robot without a namespace, whose lidar is turned by a quarter, and a map beside the bag."""
     scan = {
-        "header": {"frame_id": "rplidar_link"},
         "angle_min": -3.0,
         "angle_max": 3.0,
         "angle_increment": 0.1,
@@ -202,25 +200,18 @@ def test_mounts_are_those_of_static_transforms(tmp_path: Path) -> None:
         "ranges": np.ones(61, np.float32),
     }
     joint = {"translation": {"x": 0.1}, "rotation": {"z": np.sqrt(0.5), "w": np.sqrt(0.5)}}
-    header = {"frame_id": "base_link"}
-    static = {"transforms": [{"header": header, "child_frame_id": "rplidar_link", "transform": joint}]}
+    parent = {"frame_id": "base_link"}
+    static = {"transforms": [{"header": parent, "child_frame_id": "rplidar_link", "transform": joint}]}
     (tmp_path / "floor.yaml").write_text("image: floor.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with BagWriter(tmp_path / "bag") as writer:
-        for name, kind in (
-            ("odom", ODOMETRY),
-            ("scan", "sensor_msgs/msg/LaserScan"),
-            ("tf_static", TRANSFORMS),
-        ):
+        for name, kind in (("odom", ODOMETRY), ("scan", LASER_SCAN), ("tf_static", TRANSFORMS)):
             writer.add_topic(name, kind)
         writer.write("tf_static", 1_000_000_000_000, encode(static, TRANSFORMS))
         for k in range(50):
             at_ns = 1_000_000_000_000 + k * 100_000_000
-            row = np.array([at_ns]), np.zeros((1, 3)), np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-            writer.write("odom", at_ns, encode_odometry("odom", "base_link", *row)[0])
-            data = encode(
-                {**scan, "header": {"frame_id": "rplidar_link", "stamp": at_ns}}, "sensor_msgs/msg/LaserScan"
-            )
-            writer.write("scan", at_ns, data)
+            writer.write("odom", at_ns, odometry_bytes("robot", at_ns, frame="odom"))
+            header = {"frame_id": "rplidar_link", "stamp": at_ns}
+            writer.write("scan", at_ns, encode({**scan, "header": header}, LASER_SCAN))
     swarm = proposal(tmp_path / "bag").swarm
     (robot,) = swarm.robots
     assert robot.type == "turtlebot4"
@@ -237,14 +228,8 @@ def test_what_robots_publish_of_themselves_is_no_ground_truth(tmp_path: Path) ->
             writer.add_topic(name, kind)
         for k in range(100):
             at_ns = 1_000_000_000_000 + k * 50_000_000
-            row = (
-                np.array([at_ns]),
-                np.array([[0.01 * k, 0.0, 0.0]]),
-                np.zeros((1, 3)),
-                *[UNKNOWN_COVARIANCE] * 2,
-            )
             for name in ("r1/odom", "r1/odometry/filtered"):
-                writer.write(name, at_ns, encode_odometry("r1/odom", "r1/base_link", *row)[0])
+                writer.write(name, at_ns, odometry_bytes("r1", at_ns, (0.01 * k, 0.0, 0.0)))
             joints = [
                 {"header": {"frame_id": parent, "stamp": at_ns}, "child_frame_id": child}
                 for parent, child in (
@@ -289,18 +274,17 @@ def odd(
         for name, (kind, _) in others.items():
             writer.add_topic(name, kind)
         for k in range(100):
-            stamp_ns = np.array([START_NS + k * STEP_NS])
-            at_ns = int(stamp_ns[0]) + round(late_s * 1e9)
+            stamp_ns = START_NS + k * STEP_NS
+            at_ns = stamp_ns + round(late_s * 1e9)
             for side, name in enumerate(("r1", "r2")):
-                pose = np.array([[0.02 * k, 2.0 * side, 0.0]])
-                said = pose if x is None or side else np.array([[x, 0.0, 0.0]])
-                row = stamp_ns, said, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
-                writer.write(f"{name}/odom", at_ns, encode_odometry("odom", "base_link", *row)[0])
+                pose = (0.02 * k, 2.0 * side, 0.0)
+                said = pose if x is None or side else (x, 0.0, 0.0)
+                writer.write(f"{name}/odom", at_ns, odometry_bytes(name, stamp_ns, said, "odom"))
                 if f"{name}/ground_truth" not in others:
-                    data = encode_pose_stamped("map", stamp_ns, pose)[0]
+                    data = encode_pose_stamped("map", np.array([stamp_ns]), np.array([pose]))[0]
                     writer.write(f"{name}/ground_truth", at_ns, data)
             for name, (kind, value) in others.items():
-                fields: dict[str, object] = {"header": {"stamp": int(stamp_ns[0]), "frame_id": "map"}}
+                fields: dict[str, object] = {"header": {"stamp": stamp_ns, "frame_id": "map"}}
                 fields |= {"range": value, "max_range": 50.0} if kind == RANGE else {}
                 writer.write(name, at_ns, encode({} if kind == TRANSFORMS else fields, kind))
 

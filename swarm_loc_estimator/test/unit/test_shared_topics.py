@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_messages import big_endian
+from core_messages import big_endian, odometry_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -29,7 +29,7 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_detections,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.infrared import BrightnessSensor
 from swarm_loc_estimator.sensors.inputs import Batch, Ingest, InputConverter, live_topics
@@ -91,14 +91,11 @@ def test_what_is_written_is_read_by_us_and_by_others(
 
 
 def test_a_message_of_many_says_what_each_would_have_said_alone() -> None:
-    pose, eye, many = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5]]), np.eye(6), [2, 0]
+    pose, many = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5]]), [2, 0]
     own, shared = [], []
     for k, robot in enumerate("ca"):
-        odometry = encode_odometry(
-            f"{robot}/odom", "base", np.array([k]), pose[k : k + 1], np.zeros((1, 3)), eye, eye
-        )
         own += [
-            (f"{robot}/odom", odometry[0]),
+            (f"{robot}/odom", odometry_bytes(robot, k, pose[k])),
             (f"{robot}/detections", encode_detections("eye", k, markers(2)[k : k + 1])),
             (f"{robot}/fix", encode_fix("map", k, pose[k], np.diag([1.0, 2.0, 3.0 + 97.0 * k]))),
         ]
@@ -288,13 +285,10 @@ def test_a_matrix_that_promises_more_than_it_holds_is_no_message() -> None:
 
 
 def test_every_kind_of_input_comes_in_columns_of_its_own() -> None:
-    (pose,) = encode_odometry(
-        "a/odom", "a", np.array([T0]), np.zeros((1, 3)), np.zeros((1, 3)), np.eye(6), np.eye(6)
-    )
     matrices = [encode_brightness("a", T0 + k, (3, 4), k * np.ones((k, k)), k, 9) for k in (2, 3)]
     found, ingest = read_channels(
         ("a/brightness", matrices[0], T0 + 10),
-        ("a/odom", pose, T0 + 11),
+        ("a/odom", odometry_bytes("a", T0), T0 + 11),
         ("b/fix", encode_fix("map", T0 + 5, (1.0, 2.0, 3.0), COVARIANCE), T0 + 12),
         ("b/brightness", b"no message", T0 + 13),
         ("b/brightness", matrices[1], T0 + 14),
@@ -357,15 +351,7 @@ def test_fixes_locate_robots_that_stand_and_robots_that_drive() -> None:
     for k in range(30):
         now_ns, path = T0 + k * SECOND // 10, 0.02 * k
         blind = np.diag([1e-6, 1e-6, -1.0])
-        (pose,) = encode_odometry(
-            "a/odom",
-            "a",
-            np.array([now_ns]),
-            np.array([[path, 0.0, 0.0]]),
-            np.zeros((1, 3)),
-            np.eye(6),
-            np.eye(6),
-        )
+        pose = odometry_bytes("a", now_ns, (path, 0.0, 0.0))
         messages = [("a/odom", pose), ("a/fix", encode_fix("map", now_ns, (1.0, path, 0.0), blind))]
         if k < 5:
             messages.append(("b/fix", encode_fix("map", now_ns, (2.0, 3.0, 0.5), 1e-6 * np.eye(3))))
@@ -381,10 +367,7 @@ def test_fixes_locate_robots_that_stand_and_robots_that_drive() -> None:
 
 
 def test_odometry_of_a_robot_that_has_none_is_dropped() -> None:
-    (pose,) = encode_odometry(
-        "b/odom", "b", np.array([T0]), np.zeros((1, 3)), np.zeros((1, 3)), np.eye(6), np.eye(6)
-    )
-    found, _ = read_channels(("b/odom", pose, T0))
+    found, _ = read_channels(("b/odom", odometry_bytes("b", T0), T0))
     estimator = Estimator(SWARM_CHANNELS)
     estimator.receive(found)
     assert estimator.drops == {"no_odometry": 1}

@@ -134,8 +134,7 @@ def with_wall_camera(world: World, seed: int) -> tuple[Recording, Swarm]:
                 stamps.append(int(world.stamp_ns[k]))
     at_ns = np.array(stamps)
     camera = replace(
-        WALL,
-        sensor=replace(WALL.sensor, forward_sigma=0.02, left_sigma=0.01, heading_sigma=0.1),
+        WALL, sensor=replace(WALL.sensor, forward_sigma=0.02, left_sigma=0.01, heading_sigma=0.1)
     )
     rows = DetectionRows(np.full(at_ns.size, len(world.swarm.robots)), at_ns, joined(found), at_ns)
     swarm = replace(world.swarm, cameras=(camera,))

@@ -14,11 +14,7 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_detections,
     encode_detections,
 )
-from swarm_loc_estimator.common.messages.poses import (
-    decode_odometry,
-    encode_fix,
-    encode_odometry,
-)
+from swarm_loc_estimator.common.messages.poses import decode_odometry, encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import (
     DetectionReader,
     MessageBatch,

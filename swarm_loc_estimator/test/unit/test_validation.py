@@ -291,13 +291,7 @@ def test_memory_stays_bounded_over_a_long_run() -> None:
             if event.robot == 0 and event.pose:
                 estimator.tick(moved.stamp_ns)
         line = estimator._timeline
-        sizes.append(
-            (
-                estimator._tracks.arrays.stamp_ns.shape[1],
-                len(line._checkpoints),
-                len(line.buffer),
-            )
-        )
+        sizes.append((estimator._tracks.arrays.stamp_ns.shape[1], len(line._checkpoints), len(line.buffer)))
     assert len({size[0] for size in sizes}) == 1
     assert max(size[1] for size in sizes) <= 45
     assert max(size[2] for size in sizes[3:]) <= 1.5 * sizes[2][2]

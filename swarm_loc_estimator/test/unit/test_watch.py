@@ -18,6 +18,7 @@ from xml.etree import ElementTree as ET
 import aiohttp
 import numpy as np
 import pytest
+from core_messages import odometry_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from page_frames import unpack
@@ -27,7 +28,7 @@ from ruamel.yaml import YAML
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED, CdrError, encode
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.mapping.messages import MAX_CELLS, decode_occupancy_grid
@@ -557,23 +558,14 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
             writer.add_topic(f"{robot.name}/odom", ODOMETRY)
             writer.add_topic(f"{robot.name}/goal", POSE_STAMPED)
         writer.add_topic("map", OCCUPANCY_GRID)
-        messages = encode_odometry(
-            "a/odom",
-            "a/base_link",
-            stamps_ns,
-            np.zeros((40, 3)),
-            np.zeros((40, 3)),
-            np.eye(6),
-            UNKNOWN_COVARIANCE,
-        )
-        for k, message in enumerate(messages):
+        for k, now_ns in enumerate(stamps_ns.tolist()):
             for robot in SWARM.robots:
-                writer.write(f"{robot.name}/odom", int(stamps_ns[k]), message)
+                writer.write(f"{robot.name}/odom", now_ns, odometry_bytes("a", now_ns))
             if k % 10 == 5:
-                writer.write("map", int(stamps_ns[k]), grid_bytes(np.full((2, 3), k, np.int8)))
+                writer.write("map", now_ns, grid_bytes(np.full((2, 3), k, np.int8)))
                 goal = encode_pose_stamped("map", stamps_ns[k : k + 1], np.array([[k, 1.0, 0.5]]))[0]
-                writer.write(f"{'ab'[k == 25]}/goal", int(stamps_ns[k]), goal)
-        writer.write("map", int(stamps_ns[-1]), b"no map")
+                writer.write(f"{'ab'[k == 25]}/goal", now_ns, goal)
+        writer.write("map", now_ns, b"no map")
     return path
 
 

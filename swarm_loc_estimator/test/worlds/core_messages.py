@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
@@ -28,6 +29,14 @@ def big_endian(data: bytes, message_type: str) -> bytes:
     store = typestore()
     message = store.deserialize_cdr(data, message_type)
     return bytes(store.serialize_cdr(message, message_type, little_endian=False))
+
+
+def odometry_bytes(
+    robot: str, stamp_ns: int, pose: ArrayLike = (0.0, 0.0, 0.0), frame: str | None = None
+) -> bytes:
+    """A nav_msgs/Odometry of a robot, in `frame` if that is another than it should be."""
+    poses, frames = np.reshape(pose, (1, 3)), (frame or f"{robot}/odom", f"{robot}/base_link")
+    return encode_odometry(*frames, np.array([stamp_ns]), poses, np.zeros((1, 3)))[0]
 
 
 def detection(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[np.void]:

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from aerial_world import View, seen_from_above
-from core_messages import SECOND, T0, Event, batch_of
+from core_messages import SECOND, T0, Event, batch_of, odometry_bytes
 from core_world import Plan, World, simulate
 from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Report
-from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.mapping.map_file import save_map
@@ -164,7 +163,7 @@ def _kidnapped(_folder: Path) -> Story:
 
 def _off_map(folder: Path) -> Story:
     """Its start is wrong by a metre."""
-    path, robot, unknown = save_map(room_map(0.05), folder / "room")[0], LidarRobot(), UNKNOWN_COVARIANCE
+    path, robot = save_map(room_map(0.05), folder / "room")[0], LidarRobot()
     x, y, theta = robot.start.tolist()
     one = Robot("a", start=(x + 1.0, y, theta), start_sigma=StartSigma(0.05, 0.05, 0.05), lidar=LIDAR)
     swarm = Swarm((one,), map=path)
@@ -172,12 +171,11 @@ def _off_map(folder: Path) -> Story:
     def scans() -> Iterator[Batch]:
         ingest = Ingest(swarm)
         for at_ns in range(SWEEP_NS, 3 * SECOND, SWEEP_NS):
-            stamps_ns = np.array([at_ns - SWEEP_NS, at_ns])
-            poses, twists = robot.odometry(stamps_ns), np.zeros((2, 3))
-            moved = encode_odometry("a/odom", "a/base_link", stamps_ns, poses, twists, unknown, unknown)
-            sent = [("a/odom", data) for data in moved] + [
-                ("a/scan", scan_bytes(robot.scan(at_ns - SWEEP_NS)))
+            sent = [
+                ("a/odom", odometry_bytes("a", stamp_ns, robot.odometry(np.array([stamp_ns]))))
+                for stamp_ns in (at_ns - SWEEP_NS, at_ns)
             ]
+            sent.append(("a/scan", scan_bytes(robot.scan(at_ns - SWEEP_NS))))
             messages = [SerializedMessage(ingest.handle_of[topic], data, at_ns) for topic, data in sent]
             yield from ingest.read(MessageBatch.of(messages))
 

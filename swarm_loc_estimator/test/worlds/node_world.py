@@ -5,8 +5,10 @@ import math
 import os
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -80,16 +82,8 @@ def write_swarm(folder: Path) -> Path:
 
 def odometry_bytes(robot: str, stamp_ns: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
     """One nav_msgs/Odometry."""
-    (data,) = encode_odometry(
-        f"{robot}/odom",
-        f"{robot}/base_link",
-        np.array([stamp_ns]),
-        np.array([pose]),
-        np.zeros((1, 3)),
-        np.eye(6),
-        np.eye(6),
-    )
-    return data
+    frames = f"{robot}/odom", f"{robot}/base_link"
+    return encode_odometry(*frames, np.array([stamp_ns]), np.array([pose]), np.zeros((1, 3)))[0]
 
 
 def sight(
@@ -312,9 +306,41 @@ def report(heard: Sequence[DiagnosticArray], name: str) -> tuple[DiagnosticStatu
     return status, values_of(status)
 
 
-def is_estimated(poses: Sequence[SwarmPoses], before: int, now_ns: int) -> bool:
-    """Whether an estimate at an instant has come after some."""
-    return any(stamp_ns(one) == now_ns for one in poses[before:])
+class Steps:
+    """The simulated clock for some publishers, once an estimator hears all of them and is heard."""
+
+    def __init__(self, ros: Ros, *inputs: Publisher) -> None:
+        self._ros = ros
+        self._clock: Publisher = ros.tester.create_publisher(Clock, "/clock", 10)
+        self.poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+        ros.until(lambda: all(one.get_subscription_count() for one in (self._clock, *inputs)))
+        ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+
+    def step(self, now_ns: int, *messages: tuple[Publisher, Any]) -> None:
+        """Publish messages and the time, and wait for the estimate that follows."""
+        heard = len(self.poses)
+        for publisher, message in messages:
+            publisher.publish(message)
+        self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        self._ros.until(lambda: any(stamp_ns(one) == now_ns for one in self.poses[heard:]))
+
+
+@contextmanager
+def repeated(send: Callable[[], None], period_s: float = 0.05) -> Iterator[None]:
+    """Something is sent again and again, by a thread."""
+    end = threading.Event()
+
+    def run() -> None:
+        while not end.wait(period_s):
+            send()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
 
 
 class Program:

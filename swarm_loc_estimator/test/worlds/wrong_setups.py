@@ -8,8 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
+from swarm_loc_estimator.common.messages.cdr import (
+    IMU,
+    ODOMETRY,
+    POSE_WITH_COVARIANCE,
+    TRANSFORMS,
+    decode,
+    encode,
+)
+from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.doctor.contents import CAMERA_INFO, IMAGE
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
@@ -22,6 +29,8 @@ BAGS = Path(__file__).parents[3] / "bags"
 ROBOT = "epuck2"
 ODOM, SEEN = f"{ROBOT}/odom", f"{ROBOT}/detections"
 BOTH = (ODOM, SEEN)
+POSITIONS = ("pose.pose.position", "alternative.position")  # Of detections
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 Change = Callable[[Evidence], Evidence]
 
@@ -56,9 +65,9 @@ def edited(names: Collection[str], edit: Callable[[Any, int], object]) -> Change
             heard = topics[name]
             messages = []
             for arrival_ns, data in heard.messages:
-                message = typestore().deserialize_cdr(data, heard.type)
+                message = decode(data, heard.type)
                 edit(message, arrival_ns)
-                messages.append(Message(arrival_ns, bytes(typestore().serialize_cdr(message, heard.type))))
+                messages.append(Message(arrival_ns, encode(message, heard.type)))
             topics[name] = Heard(heard.type, messages)
         return Evidence(evidence.swarm, topics)
 
@@ -112,24 +121,23 @@ def twist_only(message: Any, arrival_ns: int) -> None:
 
 def farther(factor: float) -> Change:
     def edit(message: Any, _arrival_ns: int) -> None:
-        for one in message.detections:
-            for position in (one.pose.pose.position, one.alternative.position):
-                position.x, position.y, position.z = (
-                    factor * v for v in (position.x, position.y, position.z)
-                )
+        message.detections = message.detections.copy()
+        for name in POSITIONS:
+            message.detections[name] *= factor
 
     return edited([SEEN], edit)
 
 
 def at_zero(message: Any, _arrival_ns: int) -> None:
-    for one in message.detections:
-        one.pose.pose.position.x = one.pose.pose.position.y = one.pose.pose.position.z = 0.0
+    message.detections = message.detections.copy()
+    message.detections[POSITIONS[0]] = 0.0
 
 
 def in_body_axes(message: Any, _arrival_ns: int) -> None:
-    for one in message.detections:
-        for position in (one.pose.pose.position, one.alternative.position):
-            position.x, position.y, position.z = position.z, -position.x, -position.y
+    message.detections = message.detections.copy()
+    for name in POSITIONS:
+        right, down, ahead = message.detections[name].T.copy()
+        message.detections[name] = np.stack([ahead, -right, -down], axis=1)
 
 
 def not_a_number(message: Any, _arrival_ns: int) -> None:
@@ -193,39 +201,27 @@ def malformed(evidence: Evidence) -> Evidence:
     return with_topics(evidence, epuck2__odom=Heard(ODOMETRY, cut))
 
 
-def serialized(kind: str, **fields: Any) -> bytes:
-    """A message with a header of zeros and some other fields."""
-    types = typestore().types
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "camera")
-    message: Any = types[kind](header=header, **fields)
-    return bytes(typestore().serialize_cdr(message, kind))
-
-
 def picture(encoding: str = "mono8") -> Heard:
-    fields = {"height": 2, "width": 3, "encoding": encoding, "is_bigendian": 0, "step": 3}
-    return Heard(IMAGE, [Message(1, serialized(IMAGE, **fields, data=np.zeros(6, np.uint8)))])
+    fields = {"height": 2, "width": 3, "encoding": encoding, "step": 3, "data": np.zeros(6, np.uint8)}
+    return Heard(IMAGE, [Message(1, encode(fields, IMAGE))])
 
 
 def intrinsics(focal: float = 100.0, width: int = 3) -> Heard:
-    region = typestore().types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     k = np.array([focal, 0.0, 1.0, 0.0, focal, 1.0, 0.0, 0.0, 1.0])
     fields = {"height": 2, "width": width, "distortion_model": "plumb_bob", "d": np.zeros(5), "k": k}
-    fields |= {"r": np.eye(3).ravel(), "p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": region}
-    return Heard(CAMERA_INFO, [Message(1, serialized(CAMERA_INFO, **fields))])
+    return Heard(CAMERA_INFO, [Message(1, encode({**fields, "r": np.eye(3).ravel()}, CAMERA_INFO))])
 
 
 def transforms(*parents: str) -> Heard:
-    types = typestore().types
-    messages = []
-    for parent in parents:
-        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), parent)
-        zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        transform: Any = types["geometry_msgs/msg/Transform"](zero, turn)
-        stamped: Any = types["geometry_msgs/msg/TransformStamped"](header, f"{ROBOT}/odom", transform)
-        message: Any = types[TRANSFORMS](np.array([stamped]))
-        messages.append(Message(1, bytes(typestore().serialize_cdr(message, TRANSFORMS))))
-    return Heard(TRANSFORMS, messages)
+    rows = [
+        {
+            "header": {"frame_id": parent},
+            "child_frame_id": f"{ROBOT}/odom",
+            "transform": {"rotation": {"w": 1.0}},
+        }
+        for parent in parents
+    ]
+    return Heard(TRANSFORMS, [Message(1, encode({"transforms": [row]}, TRANSFORMS)) for row in rows])
 
 
 def published(name: str, *publishers: Publisher) -> Change:
@@ -237,11 +233,9 @@ def published(name: str, *publishers: Publisher) -> Change:
 
 
 def reporting(message: str) -> Change:
-    types = typestore().types
-    kind = "diagnostic_msgs/msg/DiagnosticArray"
-    status: Any = types["diagnostic_msgs/msg/DiagnosticStatus"](1, f"{ROBOT}/driver", message, "", [])
-    data = serialized(kind, status=[status])
-    return lambda evidence: with_topics(evidence, diagnostics=Heard(kind, [Message(1, data)]))
+    status = {"level": 1, "name": f"{ROBOT}/driver", "message": message}
+    heard = Heard(DIAGNOSTICS, [Message(1, encode({"status": [status]}, DIAGNOSTICS))])
+    return lambda evidence: with_topics(evidence, diagnostics=heard)
 
 
 def exchanged_ids(swarm: Swarm) -> Swarm:
@@ -267,15 +261,16 @@ def with_gyroscope(factor: float, first_variance: float = 0.0) -> Change:
     """A robot with a gyroscope that measures the turn rates of its odometry, times a factor."""
 
     def change(evidence: Evidence) -> Evidence:
-        types, messages, variances = typestore().types, [], np.zeros(9)
-        variances[0] = first_variance
-        zero: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        turn: Any = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        messages = []
         for arrival_ns, data in evidence.topics[ODOM].messages:
-            odometry: Any = typestore().deserialize_cdr(data, ODOMETRY)
-            rate: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, factor * odometry.twist.twist.angular.z)
-            message: Any = types[IMU](odometry.header, turn, np.zeros(9), rate, variances, zero, np.zeros(9))
-            messages.append(Message(arrival_ns, bytes(typestore().serialize_cdr(message, IMU))))
+            odometry = decode(data, ODOMETRY)
+            message = {
+                "header": odometry.header,
+                "orientation": {"w": 1.0},
+                "angular_velocity": {"z": factor * odometry.twist.twist.angular.z},
+                "angular_velocity_covariance": [first_variance] + 8 * [0.0],
+            }
+            messages.append(Message(arrival_ns, encode(message, IMU)))
         one, other, *rest = evidence.swarm.robots
         other = replace(other, imu=ImuModel(turn_noise_density=1e-3))
         swarm = replace(evidence.swarm, robots=(one, other, *rest))
@@ -310,18 +305,11 @@ def never_located(evidence: Evidence) -> Evidence:
 
 def with_fixes_in(frame: str) -> Change:
     """A robot with a fix in a frame."""
-    types, kind = typestore().types, POSE_WITH_COVARIANCE
-    header: Any = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), frame)
-    point: Any = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
-    turn: Any = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    pose: Any = types["geometry_msgs/msg/PoseWithCovariance"](
-        types["geometry_msgs/msg/Pose"](point, turn), np.eye(6).ravel()
-    )
-    data = bytes(typestore().serialize_cdr(types[kind](header, pose), kind))
+    data = encode_fix(frame, 0, (0.0, 0.0, 0.0), np.eye(3))
 
     def change(evidence: Evidence) -> Evidence:
         arrival_ns = evidence.topics[ODOM].messages[0].arrival_ns
-        return with_topics(evidence, epuck2__fix=Heard(kind, [Message(arrival_ns, data)]))
+        return with_topics(evidence, epuck2__fix=Heard(POSE_WITH_COVARIANCE, [Message(arrival_ns, data)]))
 
     return change
 
