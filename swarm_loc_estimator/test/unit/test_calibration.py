@@ -11,6 +11,7 @@ from calibration_world import SECOND, World, record, robot
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.calibrate import main
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
@@ -33,7 +34,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.sightings import ridge
+from swarm_loc_estimator.offline.calibration.sightings import ridge, sway_of
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
@@ -415,3 +416,39 @@ def test_a_bag_given_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     bag = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
     assert main([str(bag), f"{bag}/../{bag.name}", "--out", str(tmp_path / "swarm.yaml")]) == 1
     assert "a bag is given twice, which tells nothing new." in capsys.readouterr().err
+
+
+def sightings(seed: int, sway: float, time_s: float, noise: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Times, markers and bearing errors of a camera that sways and sees two of five markers at a time."""
+    rng = np.random.default_rng(seed)
+    images = 0.2 * np.arange(3000)
+    yaw, yaws = sway * rng.standard_normal(), []
+    kept = np.exp(-0.2 / time_s)
+    for _ in images:
+        yaws.append(yaw)
+        yaw = kept * yaw + np.sqrt(1.0 - kept**2) * sway * rng.standard_normal()
+    marker = np.concatenate([rng.permutation(5)[:2] for _ in images])
+    bearing = np.repeat(yaws, 2) + noise * rng.standard_normal(2 * images.size)
+    return np.repeat(images, 2), marker, bearing
+
+
+@pytest.mark.parametrize("time_s", [3.0, 10.0])
+@pytest.mark.parametrize(("sway", "noise"), [(0.02, 0.01), (0.005, 0.01)])
+def test_the_sway_of_a_camera_is_recovered(sway: float, noise: float, time_s: float) -> None:
+    found = np.array([sway_of(*sightings(seed, sway, time_s, noise)) for seed in range(6)])
+    assert np.median(found[:, 0]) == pytest.approx(sway, rel=0.15)
+    assert np.median(found[:, 1]) == pytest.approx(time_s, rel=0.35)
+
+
+def test_noise_of_single_sightings_is_no_sway() -> None:
+    assert sway_of(*sightings(1, 0.0, 5.0, 0.01)) == (0.0, 0.0)
+    time_s, marker, bearing = sightings(2, 0.02, 5.0, 0.01)
+    assert sway_of(time_s, np.zeros_like(marker), bearing) == (0.0, 0.0)  # one marker tells nothing
+
+
+def test_noise_that_is_scaled_keeps_its_ratios_between_robots() -> None:
+    sensors = (SensorModel(bearing_sigma=0.01), SensorModel(bearing_sigma=0.04))
+    swarm = Swarm(tuple(Robot(f"r{k}", sensor=sensor) for k, sensor in enumerate(sensors)))
+    scaled = with_noise(swarm, {"bearing_sigma": 0.06, "turn_drift": 1e-3})
+    assert [robot.sensor.bearing_sigma for robot in scaled.robots] == pytest.approx([0.03, 0.12])
+    assert {robot.odometry.turn_drift for robot in scaled.robots} == {1e-3}

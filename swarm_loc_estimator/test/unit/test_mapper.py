@@ -7,14 +7,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from core_messages import odometry_bytes
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import LASER, encode
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.relocation import Search
 from swarm_loc_estimator.mapping.scans import LightSightings, MotionTracker, Readings, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.swarm.swarm import Robot
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)
@@ -493,3 +497,30 @@ def test_a_stop_without_end_is_bounded() -> None:
         stop.extend(Readings(np.arange(1000) + 1000 * k, np.zeros((1000, 3)), np.ones(1000), 0.016))
     assert len(stop.turn) <= 4096
     assert stop.stamp_ns[-1] == 19_999
+
+
+STEP_NS = 20_000_000
+DISTANCE, SIGMA = 2.0, 0.05
+
+
+def laser(stamp_ns: int) -> bytes:
+    return encode({"header": {"stamp": stamp_ns}, "distance": DISTANCE, "sigma": SIGMA, "events": 1}, LASER)
+
+
+def test_a_robot_joins_where_odometry_has_it_when_it_first_sees_something() -> None:
+    """It had turned by a radian, and driven half a metre, before its first distance came."""
+    mapper = CooperativeMapper()
+    feed = MapperFeed([Robot("a", start=(1.0, 2.0, 0.5 * math.pi))], mapper, {})
+    offset = np.array([7.0, -3.0, 0.0])  # odometry need not begin at zero
+    way = [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 0.0, 1.0)]
+    way += [(0.5, 0.0, 1.0 + 0.1 * k) for k in range(1, 160)]
+    for k, pose in enumerate(way):
+        wrapped = np.array([*pose[:2], math.remainder(pose[2], 2.0 * math.pi)]) + offset
+        feed.add(0, MapperInput.ODOMETRY, odometry_bytes("a", k * STEP_NS, wrapped))
+        if k >= 3:
+            feed.add(0, MapperInput.LASER, laser(k * STEP_NS))
+    number = feed.number(0)
+    assert number is not None
+    found = mapper.graph.states[0]
+    assert found[:2] == pytest.approx([1.0, 2.5], abs=0.02)
+    assert found[2] == pytest.approx(0.5 * math.pi + 1.0, abs=0.05)

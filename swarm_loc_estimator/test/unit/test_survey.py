@@ -1,4 +1,4 @@
-"""Surveying landmarks: places, covariances and frames against the truth; wrong ids, lone parts, sentences."""
+"""Surveying landmarks, cameras, anchors: places and covariances against the truth; lone parts, sentences."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_messages import detection
+from core_messages import detection, joined
 from core_messages import joined as joined_detections
 from core_run import covariance_of_places, recording_of
 from core_world import Plan, World, simulate
@@ -14,12 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.calibration.recording import CalibrationError, read_recording, rerun
+from swarm_loc_estimator.offline.calibration.recording import (
+    CalibrationError,
+    Recording,
+    read_recording,
+    rerun,
+)
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.offline.survey.survey import survey
+from swarm_loc_estimator.offline.survey.survey import Placed, place_fixed, survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
@@ -28,6 +33,7 @@ from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import (
     Anchor,
+    Face,
     FixedCamera,
     Landmark,
     MapError,
@@ -433,3 +439,89 @@ def test_what_was_measured_rarely_is_named() -> None:
     )
     assert done.swarm.cameras == (CEILING,)
     assert not done.swarm.anchors
+
+
+COUNT = 400
+WALL = FixedCamera("wall", -3.0, 0.0, 1.5, pitch=0.45)
+HIGH, LOW = Anchor(2**64 - 1, 2.0, 3.0, 1.5), Anchor(2**63, 1.0, 3.0, 0.08)
+TAG = UwbDevice(1, z=0.08)
+PLACES = {
+    "line": np.column_stack([np.linspace(-2.0, 2.0, COUNT), np.zeros(COUNT)]),
+    "place": np.tile([0.3, 0.2], (COUNT, 1)),
+    "floor": np.random.default_rng(9).uniform(-1.5, 1.5, (COUNT, 2)),
+    "corridor": np.random.default_rng(9).uniform([-5.0, -0.4], [5.0, 0.4], (COUNT, 2)),
+}
+
+
+def placed(
+    where: str, *, camera: FixedCamera = CEILING, anchor: Anchor = HIGH, stamps: int = COUNT, seed: int = 0
+) -> Placed:
+    """What a robot tells that was at known places, whose path has errors of 5 mm."""
+    rng = np.random.default_rng(seed)
+    true = PLACES[where]
+    stamp_ns = 10**18 + np.sort(np.arange(COUNT) % stamps) * 10**8
+    face = Face("top", 7, z=0.08)
+    found = np.column_stack([true + 0.005 * rng.standard_normal(true.shape), np.zeros(COUNT)])
+
+    def at(_: IntArray, at_ns: IntArray) -> FloatArray:
+        assert np.array_equal(at_ns, stamp_ns)
+        return found
+
+    top = np.column_stack([true, np.full(COUNT, 0.08)])
+    turn = Rotation.from_euler("ZYX", [camera.yaw, camera.pitch, camera.roll]).as_matrix() @ FROM_OPTICAL
+    optical = (top - [camera.x, camera.y, camera.z]) @ turn
+    optical[:, :2] += 0.002 * optical[:, 2:] * rng.standard_normal((COUNT, 2))
+    seen = joined([detection(face.id, np.eye(4)) for _ in range(COUNT)])
+    seen["position"] = optical
+    distance = np.linalg.norm(top - [anchor.x, anchor.y, anchor.z], axis=1)
+    none = np.zeros(COUNT, dtype=np.uint64)
+    recording = Recording(
+        "bag",
+        NO_ODOMETRY,
+        DetectionRows(np.ones(COUNT, dtype=np.int64), stamp_ns, seen, stamp_ns),
+        {},
+        ranges=RangeRows(
+            np.zeros(COUNT, dtype=np.int64),
+            stamp_ns,
+            none + np.uint64(anchor.address),
+            none,
+            distance + 0.05 * rng.standard_normal(COUNT),
+            np.zeros(COUNT),
+            stamp_ns,
+        ),
+    )
+    swarm = Swarm((Robot("a", faces=(face,), uwb=TAG),), cameras=(camera,))
+    return place_fixed(recording, swarm, at, cameras=True)
+
+
+@pytest.mark.parametrize("where", ["line", "place"])
+@pytest.mark.parametrize(("camera", "anchor"), [(CEILING, HIGH), (WALL, LOW)])
+def test_robots_on_a_line_or_at_one_place_place_nothing(
+    where: str, camera: FixedCamera, anchor: Anchor
+) -> None:
+    """All that is turned about this line fits as well."""
+    found = placed(where, camera=camera, anchor=anchor)
+    assert found.cameras == (camera,)
+    assert not found.anchors
+    assert [one.partition(", since other places fit as well")[0] for one in found.remarks] == [
+        f"Camera {camera.name} stays as it is described",
+        f"Anchor {anchor.address:#x} is left out",
+    ]
+
+
+@pytest.mark.parametrize("stamps", [1, COUNT])
+def test_errors_are_within_the_sigmas_however_few_the_stamps(stamps: int) -> None:
+    """An image of many robots has one stamp."""
+    squares = []
+    for seed in range(4):
+        found = placed("floor", stamps=stamps, seed=seed)
+        (one,), (seen,) = found.anchors, found.cameras
+        assert np.linalg.norm([seen.x - CEILING.x, seen.y - CEILING.y, seen.z - CEILING.z]) < 0.02
+        squares.append(np.hypot(one.x - HIGH.x, one.y - HIGH.y) ** 2 / one.position_sigma**2)
+    assert 0.5 < np.mean(squares) < 6.0  # 2 is ideal
+
+
+def test_an_anchor_beside_a_corridor_is_placed() -> None:
+    """Its other side is told by less than a tenth of the length."""
+    (one,) = placed("corridor").anchors
+    assert np.hypot(one.x - HIGH.x, one.y - HIGH.y) < 0.1

@@ -130,7 +130,7 @@ def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatAr
     return innovation(sightings, sightings.value, value)
 
 
-# Sway: checked by test_scatter.py.
+# Sway: checked by test_calibration.py.
 _EDGES_S = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])  # Bins of the time between two sightings
 _MIN_PAIRS = 30  # Minimum number of pairs of sightings of a bin that counts
 _MAX_STEPS = 60  # Sightings after each one that are compared with it

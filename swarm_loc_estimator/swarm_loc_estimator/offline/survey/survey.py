@@ -51,7 +51,7 @@ from swarm_loc_estimator.swarm.swarm import (
     UwbDevice,
 )
 
-# Checked by test_survey_cameras_and_anchors.py.
+# Checked by test_survey.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
 _SPELLS = 8  # Spells of time of the jackknife
 _DRAWS, _DRAWN = 60, 6  # Starts of an anchor: number of draws, and ranges of each

@@ -43,7 +43,7 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 BLOCKS = 4
-# Checked by test_gain_validation.py.
+# Checked by test_ir_brightness.py.
 _EVIDENCE = math.log(100.0)  # Minimum increase of the log likelihood of all exchanges
 GAINS, ALIKE, UNKNOWN = range(3)
 """Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
