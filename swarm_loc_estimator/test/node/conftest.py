@@ -10,7 +10,6 @@ from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 
 @pytest.fixture
 def swarm_file(tmp_path: Path) -> Path:
-    """The small swarm's description."""
     return write_swarm(tmp_path)
 
 
@@ -24,7 +23,6 @@ def node(ros: Ros, swarm_file: Path) -> EstimatorNode:
 
 @pytest.fixture
 def robots(ros: Ros, node: EstimatorNode) -> Robots:
-    """The swarm's drivers, heard by the node."""
     assert node.get_name() == "estimator"
     robots = Robots(ros)
     robots.wait_for_estimator()

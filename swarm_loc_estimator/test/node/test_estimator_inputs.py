@@ -106,7 +106,6 @@ class Droplets:
 
 @pytest.fixture
 def droplets(ros: Ros, tmp_path: Path) -> Droplets:
-    """The drivers, heard by an estimator."""
     path = tmp_path / "swarm.yaml"
     path.write_text(SWARM_YAML, encoding="utf-8")
     parameters = overrides(swarm_file=str(path), use_sim_time=True, fusion_load=1.0)
@@ -115,7 +114,6 @@ def droplets(ros: Ros, tmp_path: Path) -> Droplets:
 
 
 def until_told(ros: Ros, heard: list[DiagnosticArray], now_ns: int) -> None:
-    """Wait for diagnostics that are newer."""
     ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
 
 

@@ -34,7 +34,6 @@ START = "start: {x: 0.0, y: 0.0, theta: 0.0}"
 
 
 def managed(ros: Ros, path: Path, **more: object) -> Manager:
-    """The manager of an estimator that waits for it."""
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), **WAITING, **more)))
     return Manager(ros, "estimator")
 

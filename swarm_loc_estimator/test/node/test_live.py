@@ -39,7 +39,6 @@ POSES = 40  # Of two seconds
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
     copy_part(DEMO, folder, 10.0)
     return folder

@@ -42,7 +42,6 @@ class Bridged:
 
 
 def header_of(message: Any, frame: str = "world") -> Any:
-    """The message with a header."""
     message.header.frame_id = frame
     message.header.stamp = Time(nanoseconds=T0_NS).to_msg()
     return message

@@ -39,7 +39,6 @@ robots:
 
 
 def laser_bytes(at_ns: int, inverse: float, sigma: float) -> bytes:
-    """One swarm_loc_msgs/LaserDistance."""
     message = LaserDistance()
     message.header.stamp = Time(nanoseconds=at_ns).to_msg()
     message.header.frame_id = "alpha/base_link"
@@ -118,7 +117,6 @@ def test_a_robot_looks_around_and_gets_a_map_a_fix_and_a_goal(ros: Ros, files: P
 
 
 def more_scans(node: MapperNode, before: int) -> bool:
-    """Whether the node has received a scan since it had `before`."""
     return node.feed.received[0, MapperInput.SCAN] > before
 
 

@@ -68,7 +68,6 @@ def driving(ros: Ros) -> Iterator[list[int]]:
 
 
 def newest(heard: list[DiagnosticArray]) -> tuple[int, str, dict[str, str]]:
-    """Level, sentence and values of the estimator's newest status."""
     (status,) = [one for one in heard[-1].status if one.name == "estimator"]
     return status.level, status.message, {pair.key: pair.value for pair in status.values}
 

@@ -56,7 +56,6 @@ def _player(bag: Path | str, tmp_path: Path, *arguments: str, **parameters: obje
 
 
 def _clock(ros: Ros) -> list[int]:
-    """All times told."""
     times: list[int] = []
     ros.tester.create_subscription(
         Clock, "/clock", lambda message: times.append(int(Time.from_msg(message.clock).nanoseconds)), 10_000
@@ -169,7 +168,6 @@ TOPICS = {
 
 
 def _bag(path: Path) -> Path:
-    """One message of each topic."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for name, profiles in TOPICS.items():
             topic = writer.add_connection(

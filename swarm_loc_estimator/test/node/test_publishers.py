@@ -191,7 +191,6 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory of a process."""
     return int(Path("/proc", str(pid), "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -200,7 +199,6 @@ FILES = [path for package in PACKAGES for path in sorted(ROOT.glob(f"{package}/{
 
 @pytest.fixture
 def taken() -> Iterator[frozenset[str]]:
-    """The names of all that a bare node has."""
     context = rclpy.Context()
     rclpy.init(context=context)
     node = Node("bare", context=context)

@@ -21,7 +21,6 @@ UNTIMED = "messages whose log time cannot be were skipped"
 
 
 def chunks_of(data: bytes) -> list[int]:
-    """Where the records of the chunks begin."""
     found, offset = [], 8
     while offset < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, offset)

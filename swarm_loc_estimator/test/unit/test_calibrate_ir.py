@@ -43,7 +43,6 @@ UNKNOWN_ID = 99
 
 
 def described(names: tuple[str, ...], platform: IrPlatform, source: str, first_id: int = 1) -> list[Robot]:
-    """Robots with boards that were never calibrated."""
     return [Robot(n, camera=None, ir=RobotIr(first_id + k, platform, source)) for k, n in enumerate(names)]
 
 
@@ -117,7 +116,6 @@ def gains_of(file: Path) -> list[IrGains | None]:
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """The one sentence with which the command ends."""
     assert calibrate_ir.main([str(argument) for argument in arguments]) == 1
     shown = capsys.readouterr()
     assert not shown.out

@@ -223,7 +223,6 @@ POSITION_BEARING_SIGHTINGS = 1
 
 
 def errors(world: World, *, seeing: bool) -> tuple[FloatArray, FloatArray, dict[str, int]]:
-    """Errors (T, N, 3) and covariances (T, N, 3, 3) at whole seconds, and verdicts on measurements."""
     estimator = Estimator(world.swarm, Settings())
     events = []
     for arrival_ns, event in on_time(world):

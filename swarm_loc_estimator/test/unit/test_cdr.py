@@ -74,7 +74,6 @@ def test_definitions_are_those_of_ros(message_type: str) -> None:
 
 
 def some_message(message_type: str, random: np.random.Generator) -> dict[str, Any]:
-    """A message whose numbers, texts and lengths are drawn."""
 
     def value(kind: str) -> Any:
         if kind == "string":
@@ -151,7 +150,6 @@ def pose_message(stamp_ns: int, frame: str, pose: tuple[float, float, float], z:
 
 
 def detections_of(count: int) -> list[dict[str, Any]]:
-    """Detections of which all numbers differ."""
     found = []
     for number in range(count):
         values = np.arange(1.0, 60.0) + 100 * number

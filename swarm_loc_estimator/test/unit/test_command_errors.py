@@ -160,7 +160,6 @@ def main():
 
 
 def started(folder: Path, text: str) -> subprocess.Popen[str]:
-    """A command whose module has a text, in a session of its own."""
     (folder / "interrupted.py").write_text(text, encoding="utf-8")
     (folder / "interrupted_waits.py").write_text(WAITS, encoding="utf-8")
     path = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])

@@ -95,7 +95,6 @@ def use_of(
 
 
 def noise_of(state: SwarmState, exchange: Exchange, variances: FloatArray) -> FloatArray:
-    """The variances (3,) to use it with."""
     noise: FloatArray = np.diag(use_of(state, exchange, variances).noise).copy()
     return noise
 
@@ -354,7 +353,6 @@ def same_again(world: World) -> World:
 
 
 def run(world: World) -> tuple[Estimator, list[Estimate]]:
-    """The estimates of each half second."""
     estimator = Estimator(world.swarm)
     return estimator, play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1]), 0.5))
 
@@ -406,7 +404,6 @@ def with_time_sigma(swarm: Swarm, sigma_s: float) -> Swarm:
 
 
 def measured_of(swarm: Swarm, stamps: IntArray, seen: NDArray[np.void]) -> Measurements:
-    """What the first robot's camera measures."""
     rows = DetectionRows(np.zeros(stamps.size, np.int64), stamps, seen, stamps)
     return SightingConverter(swarm).convert(rows)
 

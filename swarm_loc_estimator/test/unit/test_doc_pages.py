@@ -62,7 +62,6 @@ COMMANDS = (DOC / "commands.md").read_text(encoding="utf-8")
 
 
 def table_of(cls: type, *required: str) -> str:
-    """The numbers of a dataclass as a table of Markdown."""
     lines = ["| Key | Default | Range | Meaning |", "|---|---|---|---|"]
     given = {f.name: f.default for f in fields(cls) if f.name in number_specs(cls)}
     defaults = {name: "null" if value is None else f"{value:g}" for name, value in given.items()}
@@ -298,7 +297,6 @@ def run(name: str, *arguments: str) -> pytest.MarkDecorator:
 
 
 def columns_of(lines: list[str]) -> list[list[float]]:
-    """The numbers of each line."""
     return [[float(one) for one in re.findall(r"-?\d+(?:\.\d+)?", line)] for line in lines]
 
 

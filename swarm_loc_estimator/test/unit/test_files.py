@@ -34,7 +34,6 @@ DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of a bag with one robot."""
     folder = tmp_path_factory.mktemp("files") / "short"
     copy_part(DEMO, folder, 3.0)
     shutil.copy(DEMO / "swarm.yaml", folder)

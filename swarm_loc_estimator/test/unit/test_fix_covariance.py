@@ -85,7 +85,6 @@ def walker(**about: object) -> Swarm:
 
 
 def after_fixes(estimator: Estimator, poses: list[FloatArray], first: int = 0) -> list[Estimate]:
-    """The estimate after each of the fixes of a robot, one a second."""
     found = []
     for second, pose in enumerate(poses, first):
         stamp_ns = T0 + second * SECOND

@@ -72,7 +72,6 @@ class Found(NamedTuple):
 
 
 def found(seed: int, *, headings: bool) -> Found:
-    """Look for a robot in images that show headings or not."""
     rng = np.random.default_rng(seed)
     truth, own = drive(rng, 4, 5)
     scale = 1.0 + 0.02 * rng.standard_normal()

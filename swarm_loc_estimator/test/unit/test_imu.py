@@ -54,7 +54,6 @@ def feed(track: OdometryTracks, stamp_ns: Stamps, raw: FloatArray) -> None:
 
 
 def turn(track: OdometryTracks, stamp_ns: Stamps, rates: FloatArray) -> int:
-    """Add turn rates; the earliest change of the track."""
     change = track.extend_turns(np.zeros(stamp_ns.size, dtype=np.int64), stamp_ns, rates)
     return int(change.changed_from_ns[0])
 

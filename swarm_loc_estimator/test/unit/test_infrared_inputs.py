@@ -44,7 +44,6 @@ def relative(observer: int, target: int) -> FloatArray:
 
 
 def in_bytes(measured: Measurements) -> list[bytes]:
-    """Each measurement, whenever it arrived."""
     rows = (measured.row(k) for k in range(measured.size))
     return [b"".join(part.tobytes() for part in row[:-1]) for row in rows]
 

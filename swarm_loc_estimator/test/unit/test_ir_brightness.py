@@ -77,7 +77,6 @@ def test_contact_and_coincidence_stay_finite() -> None:
 
 
 def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, CostWorkspace]:
-    """By `cost_of`."""
     work = new_cost_workspace(model.amplitudes.shape[0], model.angles.size, False)
     return cost_of(model, pair, pose, work, work.gradients[0], work.hessians[0]), work
 
@@ -113,7 +112,6 @@ def recorded(
 
 
 def pairs_of(logs: FloatArray, receiver: IntArray, transmitter: IntArray) -> PairGains:
-    """Exact gains."""
     factors = np.exp(logs)
     return PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((len(receiver), 4)))
 

@@ -228,7 +228,6 @@ def test_any_number_of_elements_at_any_angles_will_do(name: str) -> None:
 
 
 def cost_at(pair: Pair, at: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Cost, gradient and Hessian."""
     work = new_cost_workspace(2, 6, at.size > 3)
     gradient, hessian = work.gradients[0], work.hessians[0]
     cost = cost_of(droplet().model, pair, at, work, gradient, hessian)
@@ -336,7 +335,6 @@ def cut_readings(poses: FloatArray, seed: int) -> FloatArray:
 
 
 def limits(readings: FloatArray, limit: float = LIMIT) -> FloatArray:
-    """Of all powers."""
     return np.full(readings.shape[:2], limit)
 
 

@@ -99,7 +99,6 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def cache(tmp_path: Path, compiled: Path) -> Path:
-    """A copy of it, for one test."""
     return shutil.copytree(compiled, tmp_path / "cache")
 
 
@@ -400,7 +399,6 @@ def test_nothing_is_compiled_once_robots_report() -> None:
 
 
 def compiled_late_mapper_precompile() -> list[str]:
-    """What is compiled when robots are replayed though all is warm; in a process of its own."""
     precompile_mapper_precompile()
     before = signatures()
     swarm = load_swarm(BAG / "swarm.yaml")

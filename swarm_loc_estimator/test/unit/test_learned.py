@@ -64,7 +64,6 @@ def test_what_is_learned_is_near_the_truth_and_as_sure_as_it_says(seed: int, spa
 
 
 def true_landmarks(world: World) -> FloatArray:
-    """Places (L, 2) of the landmarks."""
     angles = 2.0 * np.pi * np.arange(PLAN.landmarks) / PLAN.landmarks
     assert len(world.swarm.landmarks) == PLAN.landmarks
     return PLAN.arena * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -46,13 +46,11 @@ def messages(until_ns: int, seed: int) -> list[tuple[MapperInput, int, bytes]]:
 
 
 def changed(ranges: list[float], **fields: Any) -> ScanMessage:
-    """A scan of an instant."""
     last = 0.1 * (len(ranges) - 1)
     return ScanMessage(5, 0.0, last, 0.1, 0.0, 0.2, 4.0, np.array(ranges))._replace(**fields)
 
 
 def swept(scan: ScanMessage) -> LidarSweep:
-    """The sweep of a scan that can be used."""
     drops: Counter[str] = Counter()
     sweep = read_sweep(scan, LidarModel(range_sigma=0.01), drops, Counter())
     assert sweep is not None
@@ -61,7 +59,6 @@ def swept(scan: ScanMessage) -> LidarSweep:
 
 
 def one_stop(pairer: SweepPairer, scan: ScanMessage) -> ScanStop:
-    """The stop of a scan by a robot that stands."""
     pairer.add_odometry(0, np.zeros(3))
     pairer.add_scan(scan)
     pairer.add_odometry(10, np.zeros(3))

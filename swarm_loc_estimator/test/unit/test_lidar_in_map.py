@@ -293,12 +293,10 @@ def weaving(time_s: FloatArray) -> FloatArray:
 
 
 def straight(time_s: FloatArray) -> FloatArray:
-    """Those of a robot that drives on."""
     return np.multiply.outer(time_s, [0.3, 0.0, 0.0])
 
 
 def circling(time_s: FloatArray) -> FloatArray:
-    """Those of one that drives a circle."""
     return exp(np.multiply.outer(time_s, [0.3, 0.0, 0.8]))
 
 

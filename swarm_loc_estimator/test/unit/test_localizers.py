@@ -50,7 +50,6 @@ def turn(yaw: float, roll: float = 0.0) -> dict[str, float]:
 
 
 def pose_of(pose: tuple[float, float, float] = POSE, roll: float = 0.0) -> dict[str, Any]:
-    """A geometry_msgs/Pose, 0.2 m above the floor."""
     return {"position": {"x": pose[0], "y": pose[1], "z": 0.2}, "orientation": turn(pose[2], roll)}
 
 
@@ -59,12 +58,10 @@ def header(frame: str = "world", stamp_ns: int = STAMP_NS) -> dict[str, Any]:
 
 
 def message(source: str, fields: dict[str, Any]) -> Any:
-    """A message of a source as it comes out of its serialized form."""
     return decode(encode(fields, SOURCES[source].message_type), SOURCES[source].message_type)
 
 
 def stamped(frame: str = "world", stamp_ns: int = STAMP_NS, **pose: Any) -> Any:
-    """A geometry_msgs/PoseStamped."""
     return message("pose", {"header": header(frame, stamp_ns), "pose": pose or pose_of()})
 
 
@@ -247,7 +244,6 @@ BODIES = ("cf1=epuck1", "cf2=epuck2")
 
 
 def bodies(source: str, name: str, header: Any, pose: Any) -> tuple[str, dict[str, Any]]:
-    """Topic and message about one body."""
     place, turn = vars(pose.position), vars(pose.orientation)
     header = {"stamp": header.stamp, "frame_id": "world"}
     if source == "tf":

@@ -283,7 +283,6 @@ def test_heads_of_other_writers_of_yaml_are_read(tmp_path: Path, head: str) -> N
 
 
 def write_map(folder: Path, pixels: Image.Image, **changes: object) -> Path:
-    """A map with cells of `CELL`, its image as PNG."""
     about = {"image": "map.png", "resolution": CELL, "origin": [0.0, 0.0, 0.0], "negate": 0}
     about |= {"occupied_thresh": 0.65, "free_thresh": 0.2, **changes}
     pixels.save(folder / "map.png")

@@ -26,7 +26,6 @@ SECOND, MOVED = 1_000_000_000, np.array([1.0, 0.0])
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of the room as a file."""
     return save_map(room_map(CELL), tmp_path_factory.mktemp("maps") / "room")[0]
 
 

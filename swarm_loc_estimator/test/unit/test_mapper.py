@@ -27,7 +27,6 @@ FIRST_TURNS = ((0.5 * math.pi, 0.25), (4.0 * math.pi, 0.6))
 
 
 def look_around(robot: RoomRobot) -> list[Readings]:
-    """A first scan."""
     return [robot.turn(angle, rate) for angle, rate in FIRST_TURNS]
 
 
@@ -37,7 +36,6 @@ def feed(mapper: CooperativeMapper, number: int, parts: Sequence[Readings]) -> N
 
 
 def explore(mapper: CooperativeMapper, number: int, robot: RoomRobot, hops: int) -> None:
-    """Look around, and go to so many goals."""
     feed(mapper, number, look_around(robot))
     for _ in range(hops):
         goal = mapper.goal(number)
@@ -55,7 +53,6 @@ def error_of(mapper: CooperativeMapper, number: int, robot: RoomRobot) -> tuple[
 def assert_near(
     mapper: CooperativeMapper, number: int, robot: RoomRobot, metres: float = 0.03, degrees: float = 2.0
 ) -> None:
-    """A robot knows where it is to so much."""
     position, heading = error_of(mapper, number, robot)
     assert position < metres
     assert heading < math.radians(degrees)

@@ -24,7 +24,6 @@ from swarm_loc_estimator.swarm.swarm_file import SCHEMA_FILE, load_swarm
 
 
 def sensor_sets(name: str) -> list[tuple[str, ...]]:
-    """What robots of a type can be located by."""
     known = KNOWN_ROBOTS[name].sensors
     sets = [some for count in (1, 2) for some in combinations(known, count)]
     sets += [known[:k] + known[k + 1 :] for k in range(len(known))]
@@ -32,7 +31,6 @@ def sensor_sets(name: str) -> list[tuple[str, ...]]:
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, *answers: str) -> None:
-    """Put answers on standard input."""
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{one}\n" for one in answers)))
 
 

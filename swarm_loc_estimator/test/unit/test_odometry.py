@@ -399,7 +399,6 @@ def contradicted(
 
 
 def drive(speed: float, seconds: float) -> FloatArray:
-    """Poses (T, 3) along a line."""
     return np.outer(0.1 * speed * np.arange(round(10 * seconds)), [1.0, 0.0, 0.0])
 
 

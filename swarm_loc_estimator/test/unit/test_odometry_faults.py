@@ -74,13 +74,11 @@ class Drive:
 
 
 def stamps_of(rows: IntArray) -> IntArray:
-    """Stamps (k,) of milliseconds (k,)."""
     stamps: IntArray = T0 + MILLISECOND * rows
     return stamps
 
 
 def every(period_ms: int, drive: Drive) -> IntArray:
-    """Milliseconds of messages at a constant rate."""
     return np.arange(0, len(drive.pose), period_ms)
 
 

@@ -33,7 +33,6 @@ PACK = {".zst": zstandard.compress, ".zstd": zstandard.compress, ".lz4": lz4.fra
 
 @pytest.fixture
 def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where temporary files are made."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -226,7 +225,6 @@ def test_rows_come_back_by_key_in_their_order() -> None:
 
 
 def filled(spool: Spool, rows: int) -> None:
-    """Write rows, and read them."""
     spool.append("a", np.ones(rows))
     spool.array("a", float)
 

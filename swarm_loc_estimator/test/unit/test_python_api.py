@@ -26,7 +26,6 @@ NAMES = set(swarm_loc_estimator._MODULE_OF)
 
 
 def run(*arguments: str, **environment: str) -> str:
-    """What a Python process at the root of the workspace prints."""
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=ROOT,

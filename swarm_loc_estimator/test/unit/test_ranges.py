@@ -75,7 +75,6 @@ class Measured:
 
 
 def antenna(world: World, step: int, address: int) -> FloatArray:
-    """True place (3,) of an antenna."""
     for anchor in world.swarm.anchors:
         if anchor.address == address:
             return np.array([anchor.x, anchor.y, anchor.z])
@@ -148,7 +147,6 @@ def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
 
 
 def converted(swarm: Swarm, *measured: Measured) -> tuple[Measurements, dict[str, int]]:
-    """Measurements of messages, and what was dropped."""
     ingest, estimator = Ingest(swarm), Estimator(swarm)
     handle = {k: ingest.handle_of[f"{r.name}/ranges"] for k, r in enumerate(swarm.robots) if r.uwb}
     batch = MessageBatch.of([SerializedMessage(handle[one.robot], one.data(), T0) for one in measured])
@@ -416,7 +414,6 @@ def test_the_biases_of_anchors_are_estimated(settings: Settings, seed: int) -> N
 
 
 def with_radios(world: World, **changed: Any) -> World:
-    """The world whose robots' radios have other numbers."""
     robots = [replace(one, uwb=one.uwb and replace(one.uwb, **changed)) for one in world.swarm.robots]
     return replace(world, swarm=replace(world.swarm, robots=tuple(robots)))
 
@@ -498,7 +495,6 @@ def test_both_orders_of_a_pair_are_one_link() -> None:
 
 
 def pair_message(value: float, variance: float, *, limits: tuple[float, float] = (0.0, 0.0)) -> bytes:
-    """A sensor_msgs/Range."""
     low, high = limits
     fields = {"min_range": low, "max_range": high, "range": value, "variance": variance}
     return encode({"header": {"stamp": T0, "frame_id": "n_1"}, **fields}, PAIR_TYPE)

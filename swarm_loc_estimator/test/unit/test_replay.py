@@ -24,7 +24,6 @@ DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
     copy_part(DEMO, folder, 10.0)
     return folder
@@ -32,7 +31,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def first(bag: Path) -> ReplayResult:
-    """Its replay."""
     return replay(bag, load_swarm(DEMO / "swarm.yaml"))
 
 

@@ -87,7 +87,6 @@ def png_size(path: Path) -> tuple[int, int]:
 
 @pytest.fixture(scope="module")
 def report_of_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a report of two robots, with truth."""
     folder = tmp_path_factory.mktemp("reports") / "new" / "folder"
     write_report(result_of(2, title="<b>bag & more"), folder)
     return folder
@@ -95,7 +94,6 @@ def report_of_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def old_report(report_of_two: Path, tmp_path: Path) -> Path:
-    """A folder with a report that another one is to replace."""
     shutil.copytree(report_of_two, tmp_path / "report")
     assert {"paths.png", "errors.png"} <= {file.name for file in (tmp_path / "report").iterdir()}
     return tmp_path / "report"
@@ -318,7 +316,6 @@ LINE = "12.5 1 2 0 0 0 0 1"
 
 @pytest.fixture(scope="module")
 def result() -> ReplayResult:
-    """A run of one robot with ground truth in its bag."""
     return replay(BAG)
 
 

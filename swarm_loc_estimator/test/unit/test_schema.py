@@ -120,7 +120,6 @@ def faults_of_mapping(tree: dict[Any, Any], rule: dict[str, Any], place: str) ->
 
 
 def changed(path: str, value: Any) -> dict[Any, Any]:
-    """The whole example with another value at a dotted path."""
     tree: dict[Any, Any] = deepcopy(WHOLE)
     inner: Any = tree
     *way, last = [int(name) if name.isdigit() else name for name in path.split(".")]

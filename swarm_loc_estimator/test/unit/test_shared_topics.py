@@ -56,7 +56,6 @@ def markers(count: int) -> np.ndarray[Any, np.dtype[np.void]]:
 
 
 def read(*messages: tuple[str, bytes]) -> Batch:
-    """What comes of messages by topic, one after the other."""
     ingest = Ingest(SWARM)
     rows = [(ingest.handle_of[topic], data, 10 + k) for k, (topic, data) in enumerate(messages)]
     (inputs,) = ingest.read(MessageBatch.of([SerializedMessage(*one) for one in rows]))
@@ -235,7 +234,6 @@ FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # added to that of each fix
 
 
 def read_channels(*messages: tuple[str, bytes, int]) -> tuple[Batch, Ingest]:
-    """Messages by topic and arrival."""
     ingest = Ingest(SWARM_CHANNELS)
     batch = MessageBatch.of(
         [SerializedMessage(ingest.handle_of[topic], data, at) for topic, data, at in messages]

@@ -154,7 +154,6 @@ ALL: dict[str, Setup] = {
 
 
 def everything(world: World, seed: int) -> tuple[Recording, Swarm]:
-    """All sensors at once."""
     parts = {name: setup(world, seed) for name, setup in ALL.items()}
     robots = parts["ranges"][1].robots
     detections = [parts[name][0].detections for name in ("sightings", "fixed camera")]
@@ -170,7 +169,6 @@ def everything(world: World, seed: int) -> tuple[Recording, Swarm]:
 
 
 def at_truth(problem: BatchProblem, world: World) -> Start:
-    """Begin where all is."""
     paths = recording_of(world).truth
     nowhere = np.full((len(problem.swarm.robots), 3), np.nan)
     marks = [(one.x, one.y, one.yaw or 0.0) for one in problem.swarm.landmarks]

@@ -275,7 +275,6 @@ def confirmed() -> SourceArrays:
 
 
 def is_widened(state: SourceArrays) -> bool:
-    """Whether the covariance of the first robot is widened."""
     covariance = np.zeros((3, 3))
     widen_suspect_covariance(state, 0, covariance)
     return bool(covariance.any())

@@ -487,7 +487,6 @@ world_of = lru_cache(maxsize=16)(simulate)  # For tests that change nothing in i
 
 
 def run(world: World, settings: Settings = SPARSE, period_s: float = 0.2) -> tuple[Estimator, list[Estimate]]:
-    """A world through an estimator of its own, all in time."""
     estimator = Estimator(world.swarm, settings)
     end_ns = int(world.stamp_ns[-1])
     return estimator, play(estimator, on_time(world), ticks(T0, end_ns, period_s))

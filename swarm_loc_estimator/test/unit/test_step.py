@@ -32,7 +32,6 @@ SWARM = Swarm((Robot("r1", start=(0.0, 0.0, 0.0)),))
 
 
 def recorded(until_s: float) -> tuple[Swarm, list[Batch], int]:
-    """The first seconds of a bag, and their end."""
     swarm, parts = load_swarm(BAG / "swarm.yaml"), list[Batch]()
     read_bag(BAG, swarm, parts.append, unwatched)
     end_ns = parts[0].begin_ns + round(until_s * SECOND)

@@ -57,7 +57,6 @@ def places_of(swarm: Swarm) -> Mapping[int, FloatArray]:
 
 
 def errors(found: Swarm, true: Swarm) -> FloatArray:
-    """Errors (L, 3) of landmarks after a rigid fit to their true places."""
     poses, truth = places_of(found), places_of(true)
     a, b = (np.array([one[marker_id] for marker_id in sorted(truth)]) for one in (poses, truth))
     error: FloatArray = se2.compose(se2.rigid_fit(a[:, :2], b[:, :2]), a) - b

@@ -38,7 +38,6 @@ GRID = "settings: {horizon_s: [0.1, 2]}\nlost: [0, 0.3]\nseeds: [1, 2]\nworkers:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of a bag with one robot."""
     folder = tmp_path_factory.mktemp("sweep") / "short"
     copy_part(DEMO, folder, 3.0)
     shutil.copy(DEMO / "swarm.yaml", folder)
@@ -214,7 +213,6 @@ def test_one_and_two_workers_make_the_same_table(folder: Path) -> None:
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The keys of the jobs that run from now on."""
     ran: list[str] = []
 
     def watched(job: Job) -> sweeping.Line:
@@ -401,7 +399,6 @@ def test_a_replay_needs_nothing_of_sweeps() -> None:
 
 
 def rows(values: Callable[[str, int | None], float | None]) -> list[Row]:
-    """Rows of two bags with and without loss."""
     empty = dict.fromkeys(FIGURES)
     return [
         {

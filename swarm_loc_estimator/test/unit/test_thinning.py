@@ -111,7 +111,6 @@ def test_all_matrices_of_an_exchange_share_its_fate() -> None:
     thinning = Thinning(2)
 
     def exchange(tick: int) -> BrightnessRows:
-        """The near matrices of one exchange and the far ones of the next, of both robots."""
         stamps_ns = np.array([tick, tick + 1, tick, tick + 1])
         robot = np.array([0, 0, 1, 1])
         zero = np.zeros(4, dtype=np.int64)

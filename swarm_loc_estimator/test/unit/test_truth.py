@@ -43,7 +43,6 @@ def test_truth_is_read_by_robot_in_order_of_its_stamps() -> None:
 
 
 def converted(data: bytes, message_type: str) -> bytes:
-    """A PoseStamped as another type."""
     old = decode(data, POSE_STAMPED)
     header, pose, place = old.header, old.pose, old.pose.position
     with_covariance = {"pose": pose, "covariance": np.arange(36.0)}
@@ -62,7 +61,6 @@ def converted(data: bytes, message_type: str) -> bytes:
 
 
 def rewritten(bag: Path, source: Path, types: Sequence[str]) -> Path:
-    """A bag whose robots have ground truth of these types."""
     type_of = {f"epuck{number}/ground_truth": name for number, name in enumerate(types, 1)}
     copy_part(
         source,
@@ -75,7 +73,6 @@ def rewritten(bag: Path, source: Path, types: Sequence[str]) -> Path:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
     copy_part(DEMO, folder, 4.0)
     return folder
@@ -116,7 +113,6 @@ def test_malformed_truth_is_named(tmp_path: Path) -> None:
 
 
 def error_of(capsys: pytest.CaptureFixture[str], bag: Path, out: Path) -> list[str]:
-    """Lines of standard error of a replay that fails."""
     assert main([str(bag), "--swarm", str(DEMO / "swarm.yaml"), "--out", str(out)]) == 1
     return capsys.readouterr().err.strip().splitlines()
 

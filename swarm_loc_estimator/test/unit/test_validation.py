@@ -34,7 +34,6 @@ def assert_sound(estimate: Estimate) -> None:
 
 
 def spoiled(name: str, value: float, content: int = POSE_TWO) -> NDArray[np.void]:
-    """A sighting of a landmark with one number spoiled."""
     one = detection(1000, marker_frame(0.0, 0.0, 1.0, 0.0), content)
     one[name].flat[0] = value
     return one

@@ -146,7 +146,6 @@ def test_a_weak_token_is_refused(address: str, token: str) -> None:
 
 
 def locked_out(wrong: WrongTokens, clients: list[str]) -> float:
-    """Share of clients whose right token is refused."""
     return sum(wrong.refusal(client, "a secret", "a secret") != "" for client in clients) / len(clients)
 
 
@@ -283,7 +282,6 @@ def test_wrong_commands_are_answered(
 def head(
     server: WatchServer, *, path: str = "/", host: bytes = b"127.0.0.1", client: str = "127.0.0.1"
 ) -> str:
-    """The status line and the text that the server answers a request."""
     with socket.create_connection(("127.0.0.1", server.port), 10.0, source_address=(client, 0)) as one:
         one.sendall(f"GET {path} HTTP/1.1\r\nConnection: close\r\nHost: ".encode() + host + b"\r\n\r\n")
         answer = b"".join(iter(lambda: one.recv(65536), b"")).decode()
@@ -326,7 +324,6 @@ def test_half_a_request_is_closed_in_time(
 
 
 def read_all(connection: socket.socket) -> None:
-    """Read until the other side closes."""
     try:
         while connection.recv(4096):
             pass
@@ -490,7 +487,6 @@ SWARM = Swarm(robots=(Robot("a", start=(0.0, 0.0, 0.0)), Robot("b", start=(1.0, 
 def grid_bytes(
     cells: np.ndarray[Any, np.dtype[np.int8]], stamp_ns: int = 0, frame: str = "map", resolution: float = 0.5
 ) -> bytes:
-    """A serialized map."""
     height, width = cells.shape
     origin = {"position": {"x": -1.0, "y": 2.0}, "orientation": {"z": np.sin(0.1), "w": np.cos(0.1)}}
     info = {"resolution": resolution, "width": width, "height": height, "origin": origin}
@@ -594,7 +590,6 @@ def test_map_and_goals_of_a_bag_come_to_viewers_and_to_the_page(bag: Path, tmp_p
 
 
 def frames_of(text: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """All frames of a recording, as the page reads them."""
     data = gzip.decompress(base64.b64decode(text))
     at = 4 + struct.unpack_from("<I", data)[0]
     json.loads(data[4:at])

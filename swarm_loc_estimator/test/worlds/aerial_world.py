@@ -67,5 +67,4 @@ def _image(rng: np.random.Generator, view: View, poses: FloatArray) -> tuple[NDA
 
 
 def seconds(stamp_ns: int) -> float:
-    """Since the beginning of a world."""
     return (stamp_ns - T0) / SECOND

@@ -25,7 +25,6 @@ POSITION, POSE, POSE_TWO = 1, 2, 3
 
 
 def big_endian(data: bytes, message_type: str) -> bytes:
-    """The same message in the other byte order."""
     store = typestore()
     message = store.deserialize_cdr(data, message_type)
     return bytes(store.serialize_cdr(message, message_type, little_endian=False))

@@ -57,7 +57,6 @@ def settled(estimator: Estimator) -> dict[str, int]:
 
 
 def recording_of(world: World) -> Recording:
-    """The world's odometry and detections as a recording, with its truth."""
     moved = [event for event in world.events if event.pose is not None]
     seen = [event for event in world.events if event.detections.size]
     stamps = np.array([event.stamp_ns for event in moved])

@@ -120,7 +120,6 @@ def _surveyed(landmarks: Sequence[Landmark], plan: Plan, rng: np.random.Generato
 
 
 def lasting_errors(plan: Plan, seed: int) -> _Lasting:
-    """Those of a world's robots."""
     return _Lasting(plan, np.random.default_rng([seed, 1]), round(plan.duration_s * SECOND / _STEP_NS))
 
 

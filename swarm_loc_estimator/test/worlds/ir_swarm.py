@@ -212,7 +212,6 @@ def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> Batch:
 
 
 def column(values: Sequence[int]) -> IntArray:
-    """Whole numbers."""
     return np.array(values, dtype=np.int64)
 
 

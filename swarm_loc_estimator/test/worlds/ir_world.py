@@ -42,7 +42,6 @@ def wrapped(angle: FloatArray) -> FloatArray:
 
 
 def units(angles: FloatArray) -> FloatArray:
-    """Unit vectors (..., 2)."""
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 

@@ -128,7 +128,6 @@ def _fixes(
 
 
 def fix_of(stamp_ns: int, pose: FloatArray, arrival_ns: int) -> Batch:
-    """A fix of robot 0 at a pose (3,) in map."""
     stamp, arrival = np.array([stamp_ns]), np.array([arrival_ns])
     fix = FixRows(np.array([0]), stamp, pose[None], FIX_COVARIANCE[None], arrival)
     return Batch.of(arrival_ns, arrival_ns, fixes=fix)
@@ -141,7 +140,6 @@ def _uncertain(_folder: Path) -> Story:
 
 
 def _refuted(_folder: Path) -> Story:
-    """Its start is wrong."""
     return Story(FIXED, _fixes(lambda _: 1.0))
 
 

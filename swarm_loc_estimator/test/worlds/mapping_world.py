@@ -169,7 +169,6 @@ class LidarRobot:
 
 
 def scan_bytes(scan: ScanMessage) -> bytes:
-    """A sensor_msgs/LaserScan."""
     header = {"stamp": scan.stamp_ns, "frame_id": scan.frame_id or "a/base_scan"}
     fields = {**scan._asdict(), "header": header, "ranges": scan.ranges.astype(np.float32)}
     del fields["stamp_ns"], fields["frame_id"]

@@ -74,14 +74,12 @@ def module_at(path: Path) -> ModuleType:
 
 
 def write_swarm(folder: Path) -> Path:
-    """The small swarm's description."""
     path = folder / "swarm.yaml"
     path.write_text(SWARM_YAML, encoding="utf-8")
     return path
 
 
 def odometry_bytes(robot: str, stamp_ns: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
-    """One nav_msgs/Odometry."""
     frames = f"{robot}/odom", f"{robot}/base_link"
     return encode_odometry(*frames, np.array([stamp_ns]), np.array([pose]), np.zeros((1, 3)))[0]
 
@@ -103,12 +101,10 @@ def sight(
 
 
 def detection_bytes(robot: str, stamp_ns: int, detections: NDArray[np.void]) -> bytes:
-    """One swarm_loc_msgs/MarkerDetectionArray."""
     return encode_detections(f"{robot}/camera_optical_frame", stamp_ns, detections)
 
 
 def xytheta(pose: SwarmPose) -> NDArray[np.float64]:
-    """x, y, theta of a pose."""
     return np.array([pose.x, pose.y, pose.theta])
 
 
@@ -285,7 +281,6 @@ class Robots:
 
 
 def stamp_ns(message: Any) -> int:
-    """A message's stamp."""
     return int(Time.from_msg(message.header.stamp).nanoseconds)
 
 
@@ -296,7 +291,6 @@ def newest_status(heard: Sequence[DiagnosticArray], name: str) -> DiagnosticStat
 
 
 def values_of(status: DiagnosticStatus) -> dict[str, str]:
-    """The figures of diagnostics."""
     return {pair.key: pair.value for pair in status.values}
 
 
@@ -407,7 +401,6 @@ class Program:
 
 
 def with_patience(process: subprocess.Popen[bytes], seconds: float) -> None:
-    """Wait for the end of a process for a while; it need not come."""
     try:
         process.wait(seconds)
     except subprocess.TimeoutExpired:

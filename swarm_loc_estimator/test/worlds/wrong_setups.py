@@ -75,7 +75,6 @@ def edited(names: Collection[str], edit: Callable[[Any, int], object]) -> Change
 
 
 def shifted(names: Collection[str], seconds: float) -> Change:
-    """Stamps later by so much."""
 
     def edit(message: Any, _arrival_ns: int) -> None:
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec + round(seconds * 1e9)
@@ -304,7 +303,6 @@ def never_located(evidence: Evidence) -> Evidence:
 
 
 def with_fixes_in(frame: str) -> Change:
-    """A robot with a fix in a frame."""
     data = encode_fix(frame, 0, (0.0, 0.0, 0.0), np.eye(3))
 
     def change(evidence: Evidence) -> Evidence:
