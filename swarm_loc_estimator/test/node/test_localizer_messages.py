@@ -84,17 +84,8 @@ def environment(tmp_path: Path) -> dict[str, str]:
             path = tmp_path / "src" / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        command = [
-            sys.executable,
-            "-m",
-            "colcon",
-            "--log-base",
-            "log",
-            "build",
-            "--merge-install",
-            "--paths",
-            "src",
-        ]
+        command = [sys.executable, "-m", "colcon", "--log-base", "log", "build"]
+        command += ["--merge-install", "--paths", "src"]
         if versions:
             command += ["--cmake-args", f"-Drosidl_default_generators_DIR={PYTHON_ONLY.parent}"]
         done = subprocess.run(command, cwd=tmp_path, check=False, capture_output=True)

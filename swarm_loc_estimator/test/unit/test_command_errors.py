@@ -289,18 +289,8 @@ def test_arguments_keep_types_spaces_and_order() -> None:
 
     assert node.ros_arguments() == [
         *("--ros-args", "-r", "__node:=node", "-r", "__ns:=/epuck1", "--params-file", "all.yaml"),
-        *(
-            "-p",
-            'file:="a b: c.yaml"',
-            "-p",
-            "on:=true",
-            "-p",
-            "count:=5",
-            "-p",
-            "gain:=5.0",
-            "-p",
-            'code:="012"',
-        ),
+        *("-p", 'file:="a b: c.yaml"', "-p", "on:=true", "-p", "count:=5"),
+        *("-p", "gain:=5.0", "-p", 'code:="012"'),
     ]
 
 

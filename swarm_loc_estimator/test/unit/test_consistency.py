@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from core_geometry import nees, wrapped
 from core_messages import POSE, POSE_TWO, POSITION, T0
-from core_run import on_time, play, ticks
+from core_run import SPARSE, on_time, play, ticks
 from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from scipy.stats import chi2
 
@@ -43,16 +43,18 @@ def assert_chi_square(squared: Sequence[FloatArray]) -> None:
     assert low < samples.mean() < high
 
 
-@pytest.mark.parametrize("robots", [1, 5])
+@pytest.mark.parametrize(("settings", "robots"), [(Settings(), 1), (Settings(), 5), (SPARSE, 12)])
 @pytest.mark.parametrize(
     ("content", "flips"), [(POSE, 0.0), (POSITION, 0.0), (POSE_TWO, 0.2)], ids=["pose", "range", "two"]
 )
-def test_the_normalised_error_is_chi_square_distributed(content: int, flips: float, robots: int) -> None:
+def test_the_normalised_error_is_chi_square_distributed(
+    content: int, flips: float, settings: Settings, robots: int
+) -> None:
     """Poses of one run are correlated over time: as many samples count as there are runs and robots."""
     squared = []
     for seed in SEEDS:
         world = simulate(Plan(robots, 8.0, content=content, flips=flips, landmarks=6), 100 + seed)
-        error, covariance = errors(world, Settings(), 1.0)
+        error, covariance = errors(world, settings, 1.0)
         squared.append(nees(error, covariance)[2:].mean(axis=0))
     assert_chi_square(squared)
 
@@ -70,10 +72,16 @@ def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm]
     assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
 
 
-@pytest.mark.parametrize("many", [5, 1000])
-@pytest.mark.parametrize(("content", "robots"), [(POSE, 1), (POSITION, 3)])
+@pytest.mark.parametrize(
+    ("content", "robots", "settings"),
+    [
+        *((POSE, 1, settings) for settings in (batched(5), batched(1000))),
+        *((POSITION, 3, settings) for settings in (batched(5), batched(1000), SPARSE)),
+        (POSE, 3, SPARSE),
+    ],
+)
 def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distributed(
-    content: int, robots: int, many: int
+    content: int, robots: int, settings: Settings
 ) -> None:
     plan = Plan(robots, 20.0, content=content, lasting=1.0, speed=0.15)
 
@@ -81,21 +89,23 @@ def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distribut
         trusted = (replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots)
         return replace(world.swarm, robots=tuple(trusted))
 
-    assert_estimated([world_of(plan, 200 + seed) for seed in SEEDS], trusting, batched(many))
+    assert_estimated([world_of(plan, 200 + seed) for seed in SEEDS], trusting, settings)
 
 
-@pytest.mark.parametrize("many", [5, 1000])
+@pytest.mark.parametrize(
+    ("settings", "robots", "duration_s"), [(batched(5), 1, 30.0), (batched(1000), 1, 30.0), (SPARSE, 3, 20.0)]
+)
 @pytest.mark.parametrize("content", [POSE, POSITION])
 def test_landmarks_badly_surveyed_are_estimated_and_the_error_stays_chi_square_distributed(
-    content: int, many: int
+    content: int, settings: Settings, robots: int, duration_s: float
 ) -> None:
-    plan = Plan(1, 30.0, content=content, survey=1.0, speed=0.15)
+    plan = Plan(robots, duration_s, content=content, survey=1.0, speed=0.15)
 
     def trusting(world: World) -> Swarm:
         trusted = (replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
         return replace(world.swarm, landmarks=tuple(trusted))
 
-    assert_estimated([world_of(plan, 300 + seed) for seed in SEEDS], trusting, batched(many))
+    assert_estimated([world_of(plan, 300 + seed) for seed in SEEDS], trusting, settings)
 
 
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])

@@ -28,7 +28,7 @@ from swarm_loc_estimator.infrared.brightness import add_spread, expected_brightn
 from swarm_loc_estimator.infrared.cost import SATURATED, Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import IrOutcome, ReadingsError
+from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions, ReadingsError
 from swarm_loc_estimator.swarm.ir_board import (
     IrGains,
     IrPlatform,
@@ -41,20 +41,26 @@ ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))
 
 
+def errors_at_the_bound(solutions: IrSolutions, poses: FloatArray, platform: IrPlatform) -> FloatArray:
+    """Errors (k, 3) of solutions, which are those of the Cramer-Rao bound, as the covariances say."""
+    assert np.all(solutions.outcomes == IrOutcome.FOUND)
+    errors = pose_errors(solutions.poses, poses)
+    bound = np.mean(np.diagonal(np.linalg.inv(information(platform, poses)), axis1=1, axis2=2), axis=0)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0) / bound) < 1.1)
+    squares = nees(errors, solutions.covariances)
+    assert 2.5 < np.mean(squares) < 4.0
+    assert 2.0 < np.median(squares) < 2.7  # 2.37 in theory
+    assert np.mean(solutions.misfits) == pytest.approx(1.0, abs=0.03)
+    return errors
+
+
 @pytest.mark.parametrize("centimetres", [6, 10, 13, 16, 20, 28])
 def test_errors_are_those_of_the_cramer_rao_bound_and_the_covariance_says_so(centimetres: int) -> None:
     """Also at 12 to 15 cm, where one start from the closed form ends in wrong minima."""
     poses = random_poses(1500, centimetres, low=0.01 * centimetres, high=0.01 * centimetres)
     solutions = ALIKE.solve(readings_of(droplet(), poses, centimetres))
-    assert np.all(solutions.outcomes == IrOutcome.FOUND)
-    errors = pose_errors(solutions.poses, poses)
-    bound = np.mean(np.diagonal(np.linalg.inv(information(droplet(), poses)), axis1=1, axis2=2), axis=0)
-    assert np.all(np.sqrt(np.mean(errors**2, axis=0) / bound) < 1.1)
+    errors = errors_at_the_bound(solutions, poses, droplet())
     assert np.max(np.abs(errors[:, 0])) < 0.025
-    squares = nees(errors, solutions.covariances)
-    assert 2.5 < np.mean(squares) < 4.0
-    assert 2.0 < np.median(squares) < 2.7  # 2.37 in theory
-    assert np.mean(solutions.misfits) == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.mark.parametrize("centimetres", [8, 14, 20, 28])
@@ -372,15 +378,7 @@ def test_errors_are_those_of_the_bound_and_honest(centimetres: int) -> None:
     poses = random_poses(1500, centimetres, low=0.01 * centimetres, high=0.01 * centimetres)
     readings = cut_readings(poses, centimetres)
     solutions = ALIKE.solve(readings, None, limits(readings))
-    assert np.all(solutions.outcomes == IrOutcome.FOUND)
-    errors = pose_errors(solutions.poses, poses)
-    ends_there = replace(droplet(), saturation=LIMIT)
-    bound = np.mean(np.diagonal(np.linalg.inv(information(ends_there, poses)), axis1=1, axis2=2), axis=0)
-    assert np.all(np.sqrt(np.mean(errors**2, axis=0) / bound) < 1.1)
-    squares = nees(errors, solutions.covariances)
-    assert 2.5 < np.mean(squares) < 4.0
-    assert 2.0 < np.median(squares) < 2.7  # 2.37 in theory
-    assert np.mean(solutions.misfits) == pytest.approx(1.0, abs=0.03)
+    errors = errors_at_the_bound(solutions, poses, replace(droplet(), saturation=LIMIT))
     normed = errors / np.sqrt(np.diagonal(solutions.covariances, axis1=1, axis2=2))
     assert np.all(np.abs(np.mean(normed, axis=0)) < 4.5 / np.sqrt(len(poses)))
 

@@ -22,7 +22,7 @@ from core_messages import (
     odometry_bytes,
     quaternion,
 )
-from core_run import on_time, play, ticks
+from core_run import SPARSE, on_time, play, ticks
 from core_world import MOUNT, Plan, World, simulate
 from lost_world import CAUSES, FIX_COVARIANCE, FIXED, HOME, TICK_NS, fix_of, lose
 from mapping_world import LidarRobot, room_map
@@ -248,7 +248,7 @@ def errors(world: World, estimates: list[Estimate]) -> FloatArray:
     return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
 
 
-DENSE, SPARSE = Settings(), Settings(sparse_from=2, fusion_period_s=0.2)
+DENSE = Settings()
 FILTERS = pytest.mark.parametrize("settings", [DENSE, SPARSE], ids=["dense", "sparse"])
 
 

@@ -10,7 +10,7 @@ import pytest
 from core_messages import odometry_bytes
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.messages.cdr import LASER, encode
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
@@ -437,55 +437,49 @@ def test_a_start_that_is_far_from_where_scans_put_it_stays_as_told() -> None:
     assert np.abs(mapper.graph.poses[: len(before)] - before).max() < 0.02  # and the map is not torn
 
 
-def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
-    """Both stand; the second sees nothing but the first one's light, and learns its heading."""
-    mapper, bearing = CooperativeMapper(), math.radians(6.0)
+def heading_by_lights(
+    mapper: CooperativeMapper,
+    start: FloatArray,
+    turn: FloatArray,
+    seen: BoolArray,
+    bearing: FloatArray,
+) -> float:
+    """The heading of a robot that turns like another one at the origin, whose light alone it sees (k,)."""
     sigma = np.array([0.01, 0.01, math.radians(8.0)])
-    numbers = [mapper.join(np.array(pose), s) for pose, s in (((0.0, 0, 0), KNOWN), ((2.0, 0, 0), sigma))]
-    stamps = 20_000_000 * np.arange(1, 200)
-    odometry = np.zeros((len(stamps), 3))
-    odometry[:, 2] = np.minimum(0.02 * np.arange(len(stamps)), 1.0)
+    numbers = [mapper.join(np.zeros(3), KNOWN), mapper.join(start, sigma)]
+    stamps, count = 20_000_000 * np.arange(1, len(turn) + 1), int(seen.sum())
+    odometry = np.stack([0.0 * turn, 0.0 * turn, wrap_angle(turn)], axis=1)
     for number in numbers:
         mapper.add_readings(number, Readings(stamps, odometry, np.zeros(len(stamps)), 0.016))
-    seen = stamps[100:150]
-    angle = np.pi - bearing - 1.0  # it has turned by one radian
-    mapper.add_lights(
-        1, LightSightings(seen, np.zeros(50, dtype=np.int64), np.full(50, angle), np.full(50, 0.02))
-    )
+    of_first, sigmas = np.zeros(count, dtype=np.int64), np.full(count, 0.02)
+    mapper.add_lights(1, LightSightings(stamps[seen], of_first, bearing, sigmas))
     for number in numbers:
         mapper.leave(number)
     mapper.graph.solve(10)
     assert mapper.graph.constraints.bearings.count == 1
-    (begin, _) = np.flatnonzero(mapper.graph.robot[: mapper.graph.count] == 1)
-    assert mapper.graph.poses[begin, 2] == pytest.approx(bearing, abs=math.radians(2.0))
+    begin = np.flatnonzero(mapper.graph.robot[: mapper.graph.count] == 1)[0]
+    return float(mapper.graph.poses[begin, 2])
+
+
+def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
+    """Both stand; the second sees nothing but the first one's light, and learns its heading."""
+    bearing, turn = math.radians(6.0), np.minimum(0.02 * np.arange(199), 1.0)
+    seen = (np.arange(199) >= 100) & (np.arange(199) < 150)
+    angle = np.full(50, np.pi - bearing - 1.0)  # it has turned by one radian
+    found = heading_by_lights(CooperativeMapper(), np.array([2.0, 0.0, 0.0]), turn, seen, angle)
+    assert found == pytest.approx(bearing, abs=math.radians(2.0))
 
 
 def test_a_light_seen_twice_in_one_scan_of_wheels_that_slip_is_in_one_direction() -> None:
     """By odometry the second time is a third of a radian more than a full turn after the first one."""
     slip, off, ahead = 0.05, math.radians(6.0), 4.0 * math.pi + 0.3
     mapper = CooperativeMapper(MapperSettings(usual_slip=slip, slip_sigma=1e-4))
-    heading = math.pi - (1.0 - slip) * ahead
-    told, sigma = np.array([2.0, 0.0, heading - off]), np.array([0.01, 0.01, math.radians(8.0)])
-    numbers = [mapper.join(np.zeros(3), KNOWN), mapper.join(told, sigma)]
-    turn = 0.02 * np.arange(1, 1000)
-    stamps = 20_000_000 * np.arange(1, 1000)
-    odometry = np.zeros((len(stamps), 3))
-    odometry[:, 2] = wrap_angle(turn)
-    for number in numbers:
-        mapper.add_readings(number, Readings(stamps, odometry, np.zeros(len(stamps)), 0.016))
+    heading, turn = math.pi - (1.0 - slip) * ahead, 0.02 * np.arange(1, 1000)
     again = ahead + 2.0 * math.pi / (1.0 - slip)
     seen = (np.abs(turn - ahead) < 0.15) | (np.abs(turn - again) < 0.4)
     bearing = wrap_angle((1.0 - slip) * (ahead - turn[seen]))
-    count = int(seen.sum())
-    mapper.add_lights(
-        1, LightSightings(stamps[seen], np.zeros(count, dtype=np.int64), bearing, np.full(count, 0.02))
-    )
-    for number in numbers:
-        mapper.leave(number)
-    mapper.graph.solve(10)
-    assert mapper.graph.constraints.bearings.count == 1
-    begin = np.flatnonzero(mapper.graph.robot[: mapper.graph.count] == 1)[0]
-    assert wrap_angle(mapper.graph.poses[begin, 2] - heading) == pytest.approx(0.0, abs=math.radians(2.0))
+    found = heading_by_lights(mapper, np.array([2.0, 0.0, heading - off]), turn, seen, bearing)
+    assert wrap_angle(found - heading) == pytest.approx(0.0, abs=math.radians(2.0))
 
 
 def test_a_stop_without_end_is_bounded() -> None:

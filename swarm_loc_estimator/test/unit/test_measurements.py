@@ -153,24 +153,14 @@ def test_a_marker_at_the_sensor_itself_has_finite_numbers() -> None:
     assert np.isfinite(jacobian).all()
 
 
-def printed_6(o: FloatArray, s: FloatArray, x_c: float, m: FloatArray) -> FloatArray:
-    """Eq. (6) as printed, of a marker m on robot s seen by robot o."""
+def equation_6(o: FloatArray, s: FloatArray, x_c: float, m: FloatArray, sign: float) -> FloatArray:
+    """Eq. (6) of a marker m on robot s seen by robot o: as printed with signs of -1, right with 1."""
     cos, sin = np.cos(o[2]), np.sin(o[2])
     x_so, y_so, th_so = s[0] - o[0], s[1] - o[1], s[2] - o[2]
     cos_so, sin_so = np.cos(th_so), np.sin(th_so)
-    z = x_so * cos - y_so * sin - x_c + m[0] * cos_so + m[1] * sin_so
-    x = y_so * cos - x_so * sin + m[1] * cos_so - m[0] * sin_so
-    return np.array([z, x, s[2] + m[2] - o[2]])
-
-
-def corrected_6(o: FloatArray, s: FloatArray, x_c: float, m: FloatArray) -> FloatArray:
-    """Eq. (6) with its three signs put right."""
-    cos, sin = np.cos(o[2]), np.sin(o[2])
-    x_so, y_so, th_so = s[0] - o[0], s[1] - o[1], s[2] - o[2]
-    cos_so, sin_so = np.cos(th_so), np.sin(th_so)
-    z = x_so * cos + y_so * sin - x_c + m[0] * cos_so - m[1] * sin_so
-    x = y_so * cos - x_so * sin + m[1] * cos_so + m[0] * sin_so
-    return np.array([z, x, s[2] + m[2] - o[2]])
+    z = x_so * cos + sign * y_so * sin - x_c + m[0] * cos_so - sign * m[1] * sin_so
+    x = y_so * cos - x_so * sin + m[1] * cos_so + sign * m[0] * sin_so
+    return np.array([z, x])
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -178,8 +168,9 @@ def test_the_printed_eq_6_is_wrong_and_its_corrected_signs_are_right(seed: int) 
     s = scene(seed)
     s.sensor, s.marker = np.array([0.04, 0.0, 0.0]), np.array([0.03, 0.02, 1.0])
     value, _ = predicted("robot", CARTESIAN, s)
-    np.testing.assert_allclose(value[:2], corrected_6(s.observer, s.target, 0.04, s.marker)[:2], atol=1e-12)
-    assert np.abs(value[:2] - printed_6(s.observer, s.target, 0.04, s.marker)[:2]).max() > 1e-3
+    printed, right = (equation_6(s.observer, s.target, 0.04, s.marker, sign) for sign in (-1.0, 1.0))
+    np.testing.assert_allclose(value[:2], right, atol=1e-12)
+    assert np.abs(value[:2] - printed).max() > 1e-3
 
 
 @pytest.mark.parametrize(

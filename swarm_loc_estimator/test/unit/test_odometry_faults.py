@@ -195,42 +195,29 @@ def constant(pose: FloatArray) -> FloatArray:
     return np.tile([0.1, 0.0, 0.5], (len(pose), 1))
 
 
+@pytest.mark.parametrize("only_heading", [False, True])  # as four recorded TurtleBots
 @pytest.mark.parametrize("seed", range(4))
-def test_twists_are_integrated_in_any_order_where_the_pose_is_constant(seed: int) -> None:
+def test_twists_are_integrated_in_any_order_where_the_pose_or_the_heading_is_constant(
+    seed: int, only_heading: bool
+) -> None:
     drive = Drive(seed, 30.0, stops=0.3)
     rows = every(50, drive)
     pose, twist = drive.at(rows), drive.rates[rows]
+    reported = np.column_stack([pose[:, :2], np.full(rows.size, 0.5)]) if only_heading else constant(pose)
     tracks = OdometryTracks([Robot("a", odometry=MODEL)])
-    order = np.arange(rows.size) + drive.rng.integers(0, 8, rows.size)
+    order, robot = np.arange(rows.size) + drive.rng.integers(0, 8, rows.size), np.zeros(rows.size, np.int64)
     for part in np.array_split(np.argsort(order, kind="stable"), 60):
-        tracks.extend(
-            np.zeros(part.size, dtype=np.int64), stamps_of(rows[part]), constant(pose)[part], twist[part]
-        )
+        tracks.extend(robot[part], stamps_of(rows[part]), reported[part], twist[part])
     assert tracks.integrates_twist().all()
-    whole, _ = fed(rows, constant(pose), twist)
-    instants = stamps_of(rows)
-    found = tracks.at(np.zeros(rows.size, dtype=np.int64), instants)
-    np.testing.assert_array_equal(found.pose, whole.at(np.zeros(rows.size, dtype=np.int64), instants).pose)
+    (whole, change), instants = fed(rows, reported, twist), stamps_of(rows)
+    assert change.jumps == 0
+    found = tracks.at(robot, instants)
+    np.testing.assert_array_equal(found.pose, whole.at(robot, instants).pose)
     moved = se2.between(found.pose[0], found.pose)
     way = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum()
     assert np.hypot(*(moved - pose)[:, :2].T).max() < 0.01 + 0.01 * way
     assert np.abs(se2.wrap_angle(moved[:, 2] - pose[:, 2])).max() < 0.05
-    np.testing.assert_array_equal(found.raw, constant(pose))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_twists_are_integrated_where_only_the_heading_is_constant(seed: int) -> None:
-    """As four recorded TurtleBots, whose positions were right."""
-    drive = Drive(seed, 30.0, stops=0.3)
-    rows = every(50, drive)
-    pose, twist = drive.at(rows), drive.rates[rows]
-    tracks, change = fed(rows, np.column_stack([pose[:, :2], np.full(rows.size, 0.5)]), twist)
-    assert tracks.integrates_twist().all()
-    assert change.jumps == 0
-    found = tracks.at(np.zeros(rows.size, dtype=np.int64), stamps_of(rows)).pose
-    moved, way = se2.between(found[0], found), np.hypot(*np.diff(pose[:, :2], axis=0).T).sum()
-    assert np.hypot(*(moved - pose)[:, :2].T).max() < 0.01 + 0.01 * way
-    assert np.abs(se2.wrap_angle(moved[:, 2] - pose[:, 2])).max() < 0.05
+    np.testing.assert_array_equal(found.raw, reported)
 
 
 def test_a_robot_that_drives_straight_on_has_a_heading() -> None:

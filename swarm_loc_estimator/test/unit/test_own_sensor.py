@@ -9,25 +9,21 @@ import numpy as np
 import pytest
 from core_geometry import nees, wrapped
 from core_messages import SECOND, T0
-from core_run import play, settled, ticks
+from core_run import ALL, IN_ORDER, play_messages, settled, ticks
 from core_world import Plan, World, simulate
 from own_sensor import BEACONS, SIGMA_M, BeaconRows, BeaconSensor
 from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.filter.models import MODELS, Prediction
 from swarm_loc_estimator.filter.models import register as register_model
 from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, register
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
-from swarm_loc_estimator.timeline.settings import Policy, Settings
+from swarm_loc_estimator.timeline.settings import Settings
 
 del SENSORS[BeaconSensor.name], MODELS[BeaconSensor.model]  # known in these tests only
-IN_ORDER = Settings(fusion_period_s=0.0)
-TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
-SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
-ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
 
 
 @pytest.fixture(autouse=True)
@@ -57,15 +53,9 @@ def run(
                 data, arrival_ns = struct.pack("<qqd", stamp_ns, beacon, distance), late.uniform(0.0, late_s)
                 handle = ingest.handle_of[f"{one.name}/beacons"]
                 messages.append(SerializedMessage(handle, data, stamp_ns + int(arrival_ns * SECOND)))
-    messages.sort(key=lambda message: message.log_ns)
     events = [(e.stamp_ns + int(late.uniform(0.0, late_s) * SECOND), e) for e in world.events]
-    estimates, begin_ns = [], T0 - 1
-    for now_ns in ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25):
-        for part in ingest.read(MessageBatch.of([m for m in messages if begin_ns < m.log_ns <= now_ns])):
-            estimator.receive(part)
-        estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
-        begin_ns = now_ns
-    return estimator, estimates
+    ticks_ns = ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25)
+    return estimator, play_messages(estimator, ingest, messages, events, ticks_ns)
 
 
 def world_of(seed: int, duration_s: float = 16.0) -> World:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from core_geometry import nees, wrapped
 from core_messages import SECOND, T0
-from core_run import on_time, play, ticks
+from core_run import ALL, IN_ORDER, TOGETHER, on_time, play_messages, ticks
 from core_world import Plan, World, simulate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -33,7 +33,7 @@ from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.settings import Policy, Settings
+from swarm_loc_estimator.timeline.settings import Settings
 
 SIGMA = 0.02
 SQUARE = ((-1.5, -1.5, 0.8), (1.5, -1.5, 1.0), (1.5, 1.5, 0.8), (-1.5, 1.5, 1.0))
@@ -112,30 +112,16 @@ def ranges_of(world: World, seed: int, *, between: bool = False, differences: bo
     return sorted(found, key=lambda one: one.stamp_ns)
 
 
-IN_ORDER = Settings(fusion_period_s=0.0)
-TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
-SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
-ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
-
-
 def run(
     world: World, measured: Sequence[Measured], settings: Settings = IN_ORDER, late_s: float = 0.0
 ) -> tuple[Estimator, list[Estimate]]:
     """A world whose ranges come as bytes, late by up to so much."""
     rng, estimator, ingest = np.random.default_rng(0), Estimator(world.swarm, settings), Ingest(world.swarm)
     arrivals = [(one.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND), one) for one in measured]
-    arrivals.sort(key=lambda pair: pair[0])
     handle = [ingest.handle_of[f"{robot.name}/ranges"] for robot in world.swarm.robots]
-    estimates, begin_ns, events = [], T0 - 1, on_time(world)
-    for now_ns in ticks(T0, int(world.stamp_ns[-1]) + int(late_s * SECOND), 0.25):
-        new = [(t, one) for t, one in arrivals if begin_ns < t <= now_ns]
-        messages = [SerializedMessage(handle[one.robot], one.data(), t) for t, one in new]
-        if messages:
-            for part in ingest.read(MessageBatch.of(messages)):
-                estimator.receive(part)
-        estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
-        begin_ns = now_ns
-    return estimator, estimates
+    messages = [SerializedMessage(handle[one.robot], one.data(), t) for t, one in arrivals]
+    ticks_ns = ticks(T0, int(world.stamp_ns[-1]) + int(late_s * SECOND), 0.25)
+    return estimator, play_messages(estimator, ingest, messages, on_time(world), ticks_ns)
 
 
 def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
@@ -594,12 +580,7 @@ def test_a_pattern_that_fits_no_topic_is_named_with_the_topics_that_there_are(
 @pytest.mark.parametrize(
     "topic",
     [
-        "uwb/{from}",
-        "{to}/{from}/{from}",
-        "/uwb//{from}/{to}",
-        "a b/{from}/{to}",
-        "/{from}/{to}/",
-        "1",
+        *("uwb/{from}", "{to}/{from}/{from}", "/uwb//{from}/{to}", "a b/{from}/{to}", "/{from}/{to}/", "1"),
         40 * "a" + "-{from}/{to}",
     ],
 )

@@ -3,17 +3,14 @@
 import itertools
 import math
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from core_geometry import nees, wrapped
-from core_messages import POSE, POSITION, SECOND, T0
-from core_run import on_time, play, settled, ticks
+from core_messages import SECOND, T0
+from core_run import SPARSE, on_time, play, settled, ticks
 from core_world import Plan, World, simulate
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
@@ -481,63 +478,15 @@ def test_a_factor_says_all_covariances_that_a_new_pattern_wants(seed: int) -> No
                 np.testing.assert_allclose(found, wanted, atol=1e-10)
 
 
-SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
-
-world_of = lru_cache(maxsize=16)(simulate)  # For tests that change nothing in it
-
-
 def run(world: World, settings: Settings = SPARSE, period_s: float = 0.2) -> tuple[Estimator, list[Estimate]]:
     estimator = Estimator(world.swarm, settings)
     end_ns = int(world.stamp_ns[-1])
     return estimator, play(estimator, on_time(world), ticks(T0, end_ns, period_s))
 
 
-def is_sparse(estimator: Estimator) -> bool:
-    return isinstance(estimator._timeline.state.filter, SparseFilter)
-
-
 def distances(world: World, estimates: list[Estimate]) -> FloatArray:
     """(T, N) between estimates and truth [m]; NaN where not located."""
     return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
-
-
-def assert_chi_square(worlds: list[World]) -> None:
-    """The mean of normalised errors, one of each run and robot, is what three degrees of freedom give."""
-    squared = []
-    for world in worlds:
-        estimator, estimates = run(world, period_s=1.0)
-        assert is_sparse(estimator)
-        error = wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
-        squared.append(nees(error, np.array([e.covariances for e in estimates]))[5:].mean(axis=0))
-    samples = np.concatenate(squared)
-    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
-    assert low < samples.mean() < high
-
-
-@pytest.mark.parametrize("content", [POSE, POSITION])
-def test_the_normalised_error_is_chi_square_distributed(content: int) -> None:
-    plan = Plan(12, 10.0, content=content, landmarks=6)
-    assert_chi_square([simulate(plan, 400 + seed) for seed in range(4)])
-
-
-@pytest.mark.parametrize("content", [POSE, POSITION])
-def test_landmarks_badly_surveyed_are_estimated(content: int) -> None:
-    plan = Plan(3, 20.0, content=content, survey=1.0, speed=0.15)
-    worlds = [world_of(plan, 500 + seed) for seed in range(4)]
-    assert_chi_square(worlds)
-    own, others = [], []
-    for world in worlds:
-        trusted = tuple(replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
-        trusting = replace(world, swarm=replace(world.swarm, landmarks=trusted))
-        own.append(np.square(distances(world, run(world)[1])[25:]).mean())
-        others.append(np.square(distances(world, run(trusting)[1])[25:]).mean())
-    assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
-
-
-@pytest.mark.parametrize("content", [POSE, POSITION])
-def test_robots_described_with_sigmas_are_calibrated(content: int) -> None:
-    plan = Plan(3, 20.0, content=content, lasting=1.0, speed=0.15)
-    assert_chi_square([simulate(plan, 600 + seed) for seed in range(4)])
 
 
 def misled(world: World, liar: int, from_ns: int, by: tuple[float, float]) -> World:

@@ -91,6 +91,15 @@ def drive(
     return between(path[0], path)
 
 
+def driven(
+    path: FloatArray, seed: int, settings: MapperSettings | None = None, jump: int = -1
+) -> tuple[CooperativeMapper, FloatArray]:
+    """The mapper after the drive of a robot with a known start, and the true poses (n, 3) of its stops."""
+    mapper = CooperativeMapper(settings) if settings else CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    return mapper, drive(mapper, robot, path, np.random.default_rng(seed), jump)
+
+
 def off(mapper: CooperativeMapper, robot: int, truth: FloatArray) -> FloatArray:
     """Distances (n,) of the stops of a robot from true poses (n, 3)."""
     mine = mapper.graph.robot[: mapper.graph.count] == robot
@@ -136,12 +145,10 @@ def test_a_match_is_right_within_its_covariance_and_knows_nothing_along_a_corrid
 
 @pytest.mark.parametrize("seed", range(3))
 def test_loops_are_closed(seed: int) -> None:
-    rng, mapper = np.random.default_rng(seed), CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    truth = drive(mapper, robot, laps(1.5), rng)
+    mapper, truth = driven(laps(1.5), seed)
     mapper.finish()
     assert mapper.counters["loops_closed"] >= 10
-    assert off(mapper, robot, truth).max() < 0.25  # nothing tells how long a plain wall is but the wheels
+    assert off(mapper, 0, truth).max() < 0.25  # nothing tells how long a plain wall is but the wheels
     for tie in mapper.sweeps.loops:
         assert np.abs(between(truth[tie.begin], truth[tie.end]) - tie.pose)[:2].max() < 0.2
     assert not len(mapper.sweeps.doubts())
@@ -150,9 +157,7 @@ def test_loops_are_closed(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_loops_that_contradict_the_others_are_taken_back(seed: int) -> None:
     """Three ties in a row say that the robot is a metre beside the way on which all others lead."""
-    mapper = CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    truth = drive(mapper, robot, laps(1.5), np.random.default_rng(seed))
+    mapper, truth = driven(laps(1.5), seed)
     mapper.finish()
     before, loops = mapper.graph.poses.copy(), list(mapper.sweeps.loops)
     root, first = 50.0 * np.eye(3), mapper.graph.count - 3
@@ -173,9 +178,7 @@ def test_the_last_solution_ties_what_was_seen_at_other_times(
 ) -> None:
     """Even where no loop was closed; another one changes nothing."""
     monkeypatch.setattr(SweepMap, "_close_loops", lambda *_: None)
-    mapper = CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    truth = drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    mapper, truth = driven(laps(2.0), seed)
     half = mapper.graph.count // 2
 
     def apart() -> float:
@@ -195,9 +198,7 @@ def test_the_last_solution_ties_what_was_seen_at_other_times(
     ("tear", "at_least"), [((0.6, 0.6, 0.0), 3), ((0.35, 0.0, 0.0), 2), ((0.0, 0.0, 0.15), 2)]
 )
 def test_a_map_that_is_torn_is_in_doubt_there(tear: tuple[float, float, float], at_least: int) -> None:
-    mapper = CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    drive(mapper, robot, laps(2.0), np.random.default_rng(1))
+    mapper, _ = driven(laps(2.0), 1)
     mapper.finish()
     half, count = mapper.graph.count // 2, mapper.graph.count
     mapper.graph.states[half:count, :3] = compose(tear, mapper.graph.states[half:count, :3])
@@ -207,9 +208,7 @@ def test_a_map_that_is_torn_is_in_doubt_there(tear: tuple[float, float, float], 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sweep_that_fitted_nothing_is_in_doubt_until_others_say_the_same(seed: int) -> None:
     """The first sweep of the second lap is taken from where nothing is known, and moved into the ring."""
-    mapper = CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    mapper, _ = driven(laps(2.0), seed)
     mapper.finish()
     node = mapper.graph.count // 2
     mapper.sweeps.refused.append(node)
@@ -220,17 +219,13 @@ def test_a_sweep_that_fitted_nothing_is_in_doubt_until_others_say_the_same(seed:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_odometry_that_jumps_is_contradicted(seed: int) -> None:
-    rng, mapper = np.random.default_rng(seed), CooperativeMapper()
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    truth = drive(mapper, robot, laps(0.5), rng, jump=6)
+    mapper, truth = driven(laps(0.5), seed, jump=6)
     assert mapper.sweeps.contradicted
-    assert off(mapper, robot, truth).max() < 0.3
+    assert off(mapper, 0, truth).max() < 0.3
 
 
 def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() -> None:
-    rng, mapper = np.random.default_rng(2), CooperativeMapper()
-    first = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    truth = drive(mapper, first, laps(1.25), rng)
+    mapper, truth = driven(laps(1.25), 2)
     second = mapper.join(np.zeros(3), UNKNOWN)
     path = laps(2.0)[40:90]
     drive(mapper, second, path, np.random.default_rng(5), stops=slice(3))
@@ -241,7 +236,7 @@ def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() ->
     located = mapper.located(second)
     assert located is not None
     assert located.pose[:2] == pytest.approx(between(laps(1.0)[0], path[-1])[:2], abs=0.25)
-    assert off(mapper, first, truth).max() < 0.25
+    assert off(mapper, 0, truth).max() < 0.25
     assert cells > 500
 
 
@@ -253,20 +248,15 @@ def test_stops_without_a_sweep_are_taken_back_wherever_they_are_in_the_graph() -
 
 
 def test_a_full_graph_locates_robots_without_growing() -> None:
-    rng, mapper = np.random.default_rng(3), CooperativeMapper(MapperSettings(max_stops=90))
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    path = laps(2.0)
-    truth = drive(mapper, robot, path, rng)
+    mapper, truth = driven(laps(2.0), 3, MapperSettings(max_stops=90))
     assert mapper.graph.count == 91
-    located = mapper.located(robot)
+    located = mapper.located(0)
     assert located is not None
     assert located.pose[:2] == pytest.approx(truth[-1, :2], abs=0.15)
 
 
 def test_a_large_map_has_larger_cells() -> None:
-    mapper = CooperativeMapper(MapperSettings(max_cells=60_000))
-    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
-    drive(mapper, robot, laps(1.0), np.random.default_rng(4))
+    mapper, _ = driven(laps(1.0), 4, MapperSettings(max_cells=60_000))
     occupancy = mapper.occupancy()
     assert occupancy.log_odds.size <= 60_000
     assert occupancy.cell == pytest.approx(0.08)

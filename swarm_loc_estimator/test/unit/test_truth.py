@@ -176,19 +176,20 @@ def test_messages_of_another_type_are_not_read(
     assert "bad_message" not in report
 
 
+def filtered(topic: str, message_type: str) -> tuple[str, str]:
+    return topic.replace("/odom", "/odometry/filtered"), message_type
+
+
 @pytest.mark.parametrize(
     "remap", [{}, {"<robot>/odom": "/<robot>/odometry/filtered"}], ids=["rules", "<robot>"]
 )
 def test_mapped_topics_give_the_same_poses(
     tmp_path: Path, short: Path, remap: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def rename(topic: str, message_type: str) -> tuple[str, str]:
-        return topic.replace("/odom", "/odometry/filtered"), message_type
-
     swarm = load_swarm(DEMO / "swarm.yaml")
     remap = remap or {f"{r.name}/odom": f"{r.name}/odometry/filtered" for r in swarm.robots}
     bag, expected = tmp_path / "bag", replay(short, swarm)
-    copy_part(short, bag, rename=rename)
+    copy_part(short, bag, rename=filtered)
     result = replay(bag, swarm, remap=remap)
     assert result.poses.tobytes() == expected.poses.tobytes()
     assert not result.remarks
@@ -265,10 +266,7 @@ def test_a_rule_that_is_none_is_refused(rule: str, capsys: pytest.CaptureFixture
 def test_a_replay_that_locates_nobody_fails(
     tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def rename(topic: str, message_type: str) -> tuple[str, str]:
-        return topic.replace("/odom", "/odometry/filtered"), message_type
-
-    copy_part(short, tmp_path / "bag", rename=rename)
+    copy_part(short, tmp_path / "bag", rename=filtered)
     *_, last = error_of(capsys, tmp_path / "bag", tmp_path / "out")
     assert last.startswith("No robot was located at any time")
     assert "/odometry/filtered" in (tmp_path / "out" / "report.txt").read_text(encoding="utf-8")

@@ -418,12 +418,8 @@ def test_pages_that_are_not_let_in_are_counted(server: WatchServer) -> None:
 PACKAGE = Path(__file__).parents[2]
 VIEWERS = PACKAGE / "viewers"
 NODES_WITHOUT_DIAGNOSTICS = {
-    "droplet_steering",
-    "droplet_world",
-    "eight_steering",
-    "epuck_world",
-    "markers",
-    "pushbot_world",
+    *("droplet_steering", "eight_steering", "markers"),
+    *("droplet_world", "epuck_world", "pushbot_world"),
 }
 
 

@@ -1,22 +1,26 @@
 """Runs of the core in tests: messages handed in as they arrive, ticks, and what became of it all."""
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
+import pytest
 from core_messages import SECOND, Event, give, joined
 from core_world import World
 from scipy.linalg import block_diag
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Anchor, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 from swarm_loc_estimator.timeline.timeline import HasBudget
 
 
@@ -43,6 +47,31 @@ def play(
 def on_time(world: World) -> list[tuple[int, Event]]:
     """The world's events, each arriving at its stamp."""
     return [(event.stamp_ns, event) for event in world.events]
+
+
+IN_ORDER = Settings(fusion_period_s=0.0)
+TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
+SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
+ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
+
+
+def play_messages(
+    estimator: Estimator,
+    ingest: Ingest,
+    messages: Iterable[SerializedMessage],
+    events: Sequence[tuple[int, Event]],
+    ticks_ns: Iterable[int],
+) -> list[Estimate]:
+    """Hand in messages and events (arrival, event) as they arrive, and tick; return all estimates."""
+    waiting = sorted(messages, key=lambda message: message.log_ns)
+    estimates, begin_ns = [], -1
+    for now_ns in ticks_ns:
+        new = [message for message in waiting if begin_ns < message.log_ns <= now_ns]
+        for part in ingest.read(MessageBatch.of(new)) if new else []:
+            estimator.receive(part)
+        estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
+        begin_ns = now_ns
+    return estimates
 
 
 def ticks(begin_ns: int, end_ns: int, period_s: float = 0.1) -> list[int]:
