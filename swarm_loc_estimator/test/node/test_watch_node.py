@@ -37,11 +37,7 @@ BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Viewer:
-    """Takes what a page would, in a thread of its own.
-
-    Args:
-        url: Of the page.
-    """
+    """Takes what a page would, in a thread of its own."""
 
     def __init__(self, url: str) -> None:
         self.frames: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}

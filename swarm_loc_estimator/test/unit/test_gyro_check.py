@@ -33,13 +33,7 @@ def rate(at_s: FloatArray) -> FloatArray:
 
 
 class Drive:
-    """Odometry and turn rates of a robot that turns to both sides.
-
-    Args:
-        seed: Of the noise.
-        end_s: Duration.
-        share: Reported turn of the wheels per true turn.
-    """
+    """Odometry and turn rates of a robot that turns to both sides; its wheels report a share of each turn."""
 
     def __init__(self, seed: int, end_s: float = 40.0, share: float = 1.0) -> None:
         rng = np.random.default_rng(seed)

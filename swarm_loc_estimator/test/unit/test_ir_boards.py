@@ -160,14 +160,7 @@ class Course:
 def exchanged(
     platform: IrPlatform, course: Course, seed: int, saturation: FloatArray | float | None = None
 ) -> Exchanges:
-    """Robots with the platform's noise, of which all that lasts is the same while they stand.
-
-    Args:
-        platform: With the noise, and the saturation unless it is given.
-        course: What happens.
-        seed: Fixes all chance.
-        saturation: (ROBOTS, N) or one of all sensors [count].
-    """
+    """Robots with the platform's noise, of which all that lasts is the same while they stand."""
     rng = np.random.default_rng(seed)
     stretches = -(-course.count // course.stay)
     poses = random_poses(stretches, seed, course.nearest, course.farthest)

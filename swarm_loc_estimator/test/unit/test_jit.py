@@ -331,15 +331,7 @@ def compiled_late(size: Size) -> list[str]:
 def run_precompile(
     bag: Path, settings: Settings, *, late: bool = False, moved_landmarks: bool = False, relayed: bool = False
 ) -> None:
-    """Estimate the beginning of a bag as the node does.
-
-    Args:
-        bag: Of robots whose description is beside it.
-        settings: Of the estimator.
-        late: Whether odometry comes out of order.
-        moved_landmarks: Whether the map is wrong.
-        relayed: Whether robots share their topics, and half of what is seen is left out.
-    """
+    """Estimate the beginning of a bag as the node does; relayed: by shared topics, half of it left out."""
     swarm = load_swarm(bag / "swarm.yaml")
     if moved_landmarks:
         marks = (replace(mark, x=mark.x + 0.3 * (k % 3)) for k, mark in enumerate(swarm.landmarks))

@@ -32,14 +32,7 @@ MILLISECOND = 1_000_000
 
 
 class Drive:
-    """A robot that drives at random, sampled at a millisecond.
-
-    Args:
-        seed: Of the motion.
-        seconds: Duration [s].
-        stops: Share of the time in which it stands.
-        abrupt: Whether speeds change at once, as commands do, or within 0.3 s.
-    """
+    """A robot that drives at random and stands for a share of the time, sampled at a millisecond."""
 
     def __init__(self, seed: int, seconds: float, *, stops: float = 0.2, abrupt: bool = False) -> None:
         self.rng = np.random.default_rng(seed)
@@ -52,7 +45,7 @@ class Drive:
                 rates[begin:end, 0] = self.rng.uniform(-0.05, 0.3)
                 rates[begin:end, 2] = self.rng.choice([0.0, self.rng.uniform(-2.0, 2.0)])
             begin = end
-        if not abrupt:
+        if not abrupt:  # speeds change within 0.3 s, not at once as commands do
             smooth = np.ones(300) / 300
             rates = np.column_stack([np.convolve(column, smooth)[:count] for column in rates.T])
         turn = 1e-3 * np.concatenate([[0.0], np.cumsum(rates[:-1, 2])])

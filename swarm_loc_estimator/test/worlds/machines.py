@@ -27,12 +27,7 @@ class Radio:
 
 
 class Machines:
-    """Three machines: `robots` and `estimator`, and between them `router`.
-
-    Args:
-        stack: Ends what is started.
-        radio: Of the robots; None: a cable.
-    """
+    """Three machines: `robots`, by cable or radio, `estimator`, and between them `router`."""
 
     def __init__(self, stack: ExitStack, radio: Radio | None = None) -> None:
         self._tag, self._stack = f"sl{os.getpid()}", stack

@@ -16,12 +16,7 @@ SHUTDOWN = Transition.TRANSITION_ACTIVE_SHUTDOWN
 
 
 class Manager:
-    """Changes the state of a node by its services, by number as Nav2 does.
-
-    Args:
-        ros: Whose tester asks.
-        node: Name of the node.
-    """
+    """Changes the state of a node by its services, by number as Nav2 does."""
 
     def __init__(self, ros: Ros, node: str) -> None:
         self._ros = ros

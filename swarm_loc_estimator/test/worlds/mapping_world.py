@@ -51,13 +51,7 @@ def inverse_distances(
 
 
 class RoomRobot:
-    """A robot whose turns are short by its slip, and whose odometry does not know.
-
-    Args:
-        pose: (3,) at the start.
-        slip: Share of turns that is lost.
-        rng: Of the laser's noise; None: exact.
-    """
+    """A robot whose turns are short by its slip, which its odometry does not know; exact without `rng`."""
 
     has_niche = True  # Whether its room has the niche
 
@@ -133,11 +127,7 @@ SWEEP_NS, BEAMS = 200_000_000, 360
 
 
 class LidarRobot:
-    """A robot that drives a circle in the room without slip, and its lidar.
-
-    Args:
-        rng: Of the lidar's noise; None: exact.
-    """
+    """A robot that drives a circle in the room without slip, and its lidar; exact without `rng`."""
 
     start = np.array([1.7, 0.8, 0.0])
     has_niche = True  # Whether its room has the niche

@@ -183,12 +183,7 @@ def overrides(**values: Any) -> list[Parameter]:
 
 
 class Robots:
-    """The two robots' drivers and the simulated clock.
-
-    Args:
-        ros: Whose tester publishes.
-        qos: How odometry and sightings are published.
-    """
+    """The two robots' drivers and the simulated clock."""
 
     def __init__(self, ros: Ros, qos: QoSProfile = _RELIABLE) -> None:
         self._ros = ros
@@ -338,16 +333,7 @@ def repeated(send: Callable[[], None], period_s: float = 0.05) -> Iterator[None]
 
 
 class Program:
-    """An executable as a process of its own, its output in one file.
-
-    Args:
-        name: Of the executable.
-        log: Where its output goes.
-        parameters: ROS parameters.
-        arguments: Further ROS arguments.
-        package: Whose executable.
-        options: Arguments before those of ROS.
-    """
+    """An executable as a process of its own, its output in one file; options precede those of ROS."""
 
     def __init__(
         self,
