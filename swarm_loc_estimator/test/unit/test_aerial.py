@@ -8,12 +8,11 @@ import pytest
 from aerial_world import AerialWorld, View, seen_from_above
 from core_geometry import nees, wrapped
 from core_messages import SECOND, T0, Event
-from core_run import on_time, play, settled, ticks
+from core_run import errors, on_time, play, settled, ticks
 from core_world import Plan, World
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -27,11 +26,6 @@ def run(
     estimator = Estimator(world.swarm, settings)
     last_ns = max(arrival_ns for arrival_ns, _ in arrivals)
     return estimator, play(estimator, arrivals, ticks(T0, last_ns, period_s))
-
-
-def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
-    """Errors (T, N, 3), NaN of robots that wait."""
-    return np.array([wrapped(one.poses - world.at(one.stamp_ns)) for one in estimates])
 
 
 @pytest.mark.parametrize("headings", [False, True])

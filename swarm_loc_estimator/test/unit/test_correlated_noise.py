@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from core_geometry import marker_frame, nees, wrapped
 from core_messages import POSITION, SECOND, T0, Event, detection, joined
-from core_run import on_time, play, ticks
+from core_run import errors, on_time, play, ticks
 from core_world import Plan, World, simulate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -491,7 +491,7 @@ def mean_errors(world: World, swarm: Swarm, settings: Settings) -> tuple[FloatAr
     """NEES (N,) of each robot over time, and the mean squared error of positions [m^2]."""
     end_ns = int(world.stamp_ns[-1])
     estimates = play(Estimator(swarm, settings), on_time(world), ticks(T0, end_ns, 1.0))
-    error = wrapped(np.array([one.poses - world.at(one.stamp_ns) for one in estimates]))[2:]
+    error = errors(world, estimates)[2:]
     squared: FloatArray = nees(error, np.array([one.covariances for one in estimates])[2:]).mean(axis=0)
     return squared, float(np.nanmean(error[..., :2] ** 2))
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_geometry import wrapped
 from core_messages import SECOND, T0
-from core_run import covariance_of_places, on_time, play, ticks
+from core_run import covariance_of_places, errors, on_time, play, ticks
 from core_world import MOUNT, Plan, World, lasting_errors, simulate
 
 from bench.shared.bags import copy_part
@@ -33,7 +32,7 @@ def run(world: World, settings: Settings | None = None) -> tuple[Swarm, FloatArr
     """What a run teaches, and its errors (T, N, 3)."""
     estimator = Estimator(world.swarm, settings)
     estimates = play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1]), 1.0))
-    return estimator.learned(), wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
+    return estimator.learned(), errors(world, estimates)
 
 
 @pytest.mark.parametrize("sparse_from", [2, 250])

@@ -22,14 +22,13 @@ from core_messages import (
     odometry_bytes,
     quaternion,
 )
-from core_run import SPARSE, on_time, play, ticks
+from core_run import SPARSE, distances, on_time, play, ticks
 from core_world import MOUNT, Plan, World, simulate
 from lost_world import CAUSES, FIX_COVARIANCE, FIXED, HOME, TICK_NS, fix_of, lose
 from mapping_world import LidarRobot, room_map
 from test_lidar_in_map import CELL, hand_in, sent, swarm_at
 
 from bench.shared.bags import copy_part
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.health import Level
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE
@@ -243,11 +242,6 @@ def test_a_loss_out_of_range_is_refused(share: float, seed: int, said: str) -> N
         Loss(share, seed)
 
 
-def errors(world: World, estimates: list[Estimate]) -> FloatArray:
-    """Distances (T, N) between estimates and truth [m]; NaN where not located."""
-    return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
-
-
 DENSE = Settings()
 FILTERS = pytest.mark.parametrize("settings", [DENSE, SPARSE], ids=["dense", "sparse"])
 
@@ -266,7 +260,7 @@ def test_a_swarm_with_unknown_starts_finds_itself(content: int, seed: int, setti
     estimates = run(world, settings)
     assert (estimates[0].status == Status.WAITING).all()
     assert (estimates[-1].status == Status.TRACKED).all()
-    error = errors(world, estimates)
+    error = distances(world, estimates)
     assert error[-1].max() < 0.05
     for estimate in estimates if settings is DENSE else []:
         located = estimate.status != Status.WAITING
@@ -283,7 +277,7 @@ def test_a_robot_that_sees_no_landmark_is_located_through_another(seed: int, set
         if event.robot == 1:
             event.detections["id"][event.detections["id"] >= 1000] = 99
     estimates = run(world, settings)
-    error = errors(world, estimates)
+    error = distances(world, estimates)
     assert np.isfinite(error[-1, 1])
     assert np.nanmax(error[:, 1]) < 0.3
     assert estimates[-1].fix_age_s[1] == -1.0
@@ -292,7 +286,7 @@ def test_a_robot_that_sees_no_landmark_is_located_through_another(seed: int, set
 @pytest.mark.parametrize("seed", range(5))
 def test_mirrored_headings_do_not_mislead_a_robot_that_starts_unknown(seed: int) -> None:
     world = simulate(Plan(2, 10.0, content=POSE_TWO, start_known=(False,), landmarks=4, flips=0.4), seed)
-    assert np.nanmax(errors(world, run(world))) < 0.3
+    assert np.nanmax(distances(world, run(world))) < 0.3
 
 
 def standing(content: int, marks: int, mirrored: float = 0.0) -> list[Estimate]:
@@ -338,7 +332,7 @@ def test_a_robot_that_is_carried_away_is_lost_and_found_again_and_harms_nobody(
     """It is lost because its sightings are gated and speak against it; its odometry knows nothing of it."""
     world = simulate(Plan(4, 16.0, content=content, landmarks=6, carried=(0,)), seed)
     estimates = run(world, settings)
-    error, status = errors(world, estimates), np.array([e.status for e in estimates])
+    error, status = distances(world, estimates), np.array([e.status for e in estimates])
     assert error[81, 0] > 0.15 or np.isnan(error[81, 0])
     assert Status.WAITING in status[81 : 81 + 30, 0]  # ticks of 0.1 s
     assert Status.WAITING not in status[1:81, 0]
@@ -359,7 +353,7 @@ def test_a_start_that_sightings_contradict_gives_way_to_them() -> None:
     assert status[0] == Status.UNCONFIRMED
     tracked = np.flatnonzero(status == Status.TRACKED)
     assert tracked[0] < 30  # ticks of 0.1 s
-    assert errors(world, estimates)[tracked, 0].max() < 0.05
+    assert distances(world, estimates)[tracked, 0].max() < 0.05
 
 
 @pytest.mark.parametrize("many", [64, 1])
@@ -383,7 +377,7 @@ def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
     assert Status.WAITING not in before
     assert (Status.WAITING in after) == is_lost
     assert after[-1] == Status.TRACKED
-    assert errors(world, estimates)[-1, 0] < 0.05
+    assert distances(world, estimates)[-1, 0] < 0.05
 
 
 @pytest.mark.parametrize(("lost_sigma", "lost_heading_sigma"), [(0.03, 10.0), (1e3, 0.08)])
@@ -446,7 +440,7 @@ def test_a_robot_silent_for_a_minute_comes_back() -> None:
     status = np.array([estimate.status for estimate in estimates])
     assert set(status[16:120, 0]) <= {Status.STALE, Status.WAITING}
     assert (status[6:, 1] == Status.TRACKED).all()
-    error = errors(world, estimates)
+    error = distances(world, estimates)
     assert error[:, 1].max() < 0.15
     assert error[-1, 0] < 0.1
 
@@ -457,7 +451,7 @@ def test_a_robot_that_leaves_does_not_hold_the_others_up(settings: Settings) -> 
     left = tuple(e for e in world.events if e.robot != 2 or e.stamp_ns < T0 + 3 * SECOND)
     stay = run(replace(world, events=left), settings)
     assert stay[-1].status[2] != Status.TRACKED
-    assert errors(world, stay)[-1, :2].max() < 0.05
+    assert distances(world, stay)[-1, :2].max() < 0.05
 
 
 def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_fourth_confirms_it() -> None:

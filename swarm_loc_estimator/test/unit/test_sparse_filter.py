@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from core_messages import SECOND, T0
-from core_run import SPARSE, on_time, play, settled, ticks
+from core_run import SPARSE, distances, on_time, play, settled, ticks
 from core_world import Plan, World, simulate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -482,11 +482,6 @@ def run(world: World, settings: Settings = SPARSE, period_s: float = 0.2) -> tup
     estimator = Estimator(world.swarm, settings)
     end_ns = int(world.stamp_ns[-1])
     return estimator, play(estimator, on_time(world), ticks(T0, end_ns, period_s))
-
-
-def distances(world: World, estimates: list[Estimate]) -> FloatArray:
-    """(T, N) between estimates and truth [m]; NaN where not located."""
-    return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
 
 
 def misled(world: World, liar: int, from_ns: int, by: tuple[float, float]) -> World:

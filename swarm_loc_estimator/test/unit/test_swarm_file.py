@@ -497,6 +497,40 @@ def test_a_mistake_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, 
     assert error_of(tmp_path, DESCRIPTION.replace(old, new, 1)) == sentence
 
 
+NO_PAIRS = ["uwb/{from}", "{to}/{from}/{from}", "/uwb//{from}/{to}", "a b/{from}/{to}", "/{from}/{to}/"]
+NO_PAIRS += ["1", 40 * "a" + "-{from}/{to}"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("topics: {odom: x}", "topics.odom must begin with <robot> or the name of a robot or camera, and /"),
+        ("topics: {r9/odom: x}", "topics.r9/odom must begin with <robot>"),
+        ("topics: {r1/odom: 'a b'}", "topics.r1/odom is 'a b' but must be a topic"),
+        ("topics: {<robot>/odom: odom}", "must be the topic of only one robot"),
+        ("topics: {r1/odom: odom, r2/odom: odom}", "must be the topic of only one robot"),
+        ("localizer: {sorce: tf}", "'localizer.sorce' is not a known key; the nearest one is 'source'"),
+        ("localizer: {source: ft}", "localizer.source = 'ft' must be one of pose,"),
+        ("localizer: {latency_s: 3}", "localizer.latency_s = 3.0 must lie in [0, 2] s"),
+        (f"localizer: {{latency_s: -{10**400}}}", "localizer.latency_s = -inf must lie in [0, 2] s"),
+        *(
+            (f"range_topic: '{topic}'", "must be a topic with {from} and {to} once each")
+            for topic in NO_PAIRS
+        ),
+        ("anchors: [{address: 2, name: a/b, x: 0, y: 0}]", "anchors[0].name is 'a/b' but must be up to 64"),
+        ("anchors: [{address: 2, name: 1, x: 0, y: 0}]", "anchors[0].name is 1 but must be up to 64 letters"),
+        (
+            "anchors: [{address: 1, x: 0, y: 0}, {address: 2, name: '1', x: 0, y: 0}]",
+            "uwb.name 1 belongs to both anchors[0] and anchors[1]; ids must be unique",
+        ),
+    ],
+)
+def test_wrong_topics_localizers_and_names_of_radios_are_refused(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    assert said in error_of(tmp_path, f"fileversion: 1\nrobots: {{r1: {{}}, r2: {{}}}}\n{text}\n")
+
+
 def test_the_example_of_the_page_is_a_description(tmp_path: Path) -> None:
     text = DOC.read_text(encoding="utf-8").split("```yaml\n")[1].partition("```")[0]
     swarm = load(tmp_path, text)

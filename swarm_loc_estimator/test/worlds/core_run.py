@@ -4,6 +4,7 @@ from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 import pytest
+from core_geometry import wrapped
 from core_messages import SECOND, Event, give, joined
 from core_world import World
 from scipy.linalg import block_diag
@@ -77,6 +78,16 @@ def play_messages(
 def ticks(begin_ns: int, end_ns: int, period_s: float = 0.1) -> list[int]:
     """Instants of ticks, the last one at `end_ns`."""
     return [*range(begin_ns, end_ns, round(period_s * SECOND)), end_ns]
+
+
+def errors(world: World, estimates: Iterable[Estimate]) -> FloatArray:
+    """Errors (T, N, 3); NaN of robots that are not located."""
+    return wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
+
+
+def distances(world: World, estimates: Iterable[Estimate]) -> FloatArray:
+    """(T, N) between estimates and truth [m]; NaN of robots that are not located."""
+    return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
 
 
 def settled(estimator: Estimator) -> dict[str, int]:
