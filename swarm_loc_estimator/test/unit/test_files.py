@@ -45,51 +45,22 @@ def result(short: Path) -> ReplayResult:
     return run(short)
 
 
-def text(_: ReplayResult, folder: Path) -> None:
-    write_whole(folder / "a.txt", "x" * 100_000)
+ROW: Row = {"bag": "a", "seed": 1, "lost": 0.5, "position_rmse_m": 0.1, "heading_rmse_deg": 1.0, "nees": 3.0}
+Write = Callable[[ReplayResult, Path], object]
+WRITERS: dict[str, Write] = {
+    "text": lambda _, folder: write_whole(folder / "a.txt", "x" * 100_000),
+    "tree": lambda _, folder: write_tree({f"key{k}": k for k in range(10_000)}, folder / "a.yaml"),
+    "report": write_report,
+    "poses": lambda result, folder: replay.write_poses(result, folder / "poses.csv"),
+    "tum": write_tum,
+    "mcap": lambda result, folder: write_mcap(result, folder / "a.mcap"),
+    "map": lambda _, folder: save_map(OccupancyMap(np.zeros(2), 0.02, np.zeros((300, 300))), folder / "map"),
+    "results": lambda _, folder: write_results([{**ROW, "failure": "x" * 100}] * 200, ["lost"], folder),
+}
+EACH = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 
 
-def tree(_: ReplayResult, folder: Path) -> None:
-    write_tree({f"key{k}": k for k in range(10_000)}, folder / "a.yaml")
-
-
-def report(result: ReplayResult, folder: Path) -> None:
-    write_report(result, folder)
-
-
-def poses(result: ReplayResult, folder: Path) -> None:
-    replay.write_poses(result, folder / "poses.csv")
-
-
-def tum(result: ReplayResult, folder: Path) -> None:
-    write_tum(result, folder)
-
-
-def mcap(result: ReplayResult, folder: Path) -> None:
-    write_mcap(result, folder / "a.mcap")
-
-
-def occupancy(_: ReplayResult, folder: Path) -> None:
-    save_map(OccupancyMap(np.zeros(2), 0.02, np.zeros((300, 300))), folder / "map")
-
-
-def results(_: ReplayResult, folder: Path) -> None:
-    row: Row = {
-        "bag": "a",
-        "seed": 1,
-        "lost": 0.5,
-        "position_rmse_m": 0.1,
-        "heading_rmse_deg": 1.0,
-        "nees": 3.0,
-    }
-    write_results([{**row, "failure": "x" * 100}] * 200, ["lost"], folder)
-
-
-Write = Callable[[ReplayResult, Path], None]
-WRITERS = [text, tree, report, poses, tum, mcap, occupancy, results]
-
-
-@pytest.mark.parametrize("write", WRITERS)
+@EACH
 def test_a_full_disk_leaves_the_old_files_and_is_said_with_the_path(
     write: Write, result: ReplayResult, tmp_path: Path
 ) -> None:
@@ -106,7 +77,7 @@ def test_a_full_disk_leaves_the_old_files_and_is_said_with_the_path(
     assert [*(tmp_path / "new").iterdir()] == []
 
 
-@pytest.mark.parametrize("write", WRITERS)
+@EACH
 def test_a_file_is_not_cut_wherever_the_disk_ends(write: Write, result: ReplayResult, tmp_path: Path) -> None:
     write(result, tmp_path / "out")
     largest = max(file.stat().st_size for file in (tmp_path / "out").iterdir())
@@ -115,7 +86,7 @@ def test_a_file_is_not_cut_wherever_the_disk_ends(write: Write, result: ReplayRe
             write(result, tmp_path / "new")
 
 
-@pytest.mark.parametrize("write", WRITERS)
+@EACH
 def test_nothing_is_written_through_links(write: Write, result: ReplayResult, tmp_path: Path) -> None:
     write(result, tmp_path / "out")
     for file in [*(tmp_path / "out").iterdir()]:
