@@ -31,7 +31,7 @@ from node_world import (
     values_of,
     xytheta,
 )
-from node_world import SWARM_YAML as SWARM_YAML_LOCAL_FRAME_NODE
+from node_world import SWARM_YAML as SMALL_SWARM
 from rcl_interfaces.msg import Log
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
@@ -246,9 +246,7 @@ def test_detections_of_a_fixed_camera_locate_a_robot(ros: Ros, estimator: Estima
 def test_poses_without_a_map_are_in_a_frame_of_a_robot_until_landmarks_come(
     ros: Ros, swarm_file: Path
 ) -> None:
-    swarm_file.write_text(
-        SWARM_YAML_LOCAL_FRAME_NODE.replace(", start: {x: 0.0, y: 0.0, theta: 0.0}", ""), encoding="utf-8"
-    )
+    swarm_file.write_text(SMALL_SWARM.replace(", start: {x: 0.0, y: 0.0, theta: 0.0}", ""), encoding="utf-8")
     parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, origin_after_s=0.5, **SETTINGS)
     ros.add(EstimatorNode(parameter_overrides=parameters))
     robots, alpha, beta = Robots(ros), (1.0, 1.0, np.pi), (0.0, 1.0, 0.0)
@@ -284,7 +282,7 @@ def test_poses_without_a_map_are_in_a_frame_of_a_robot_until_landmarks_come(
 
 
 ANCHORS = {16: (-3.0, -3.0), 17: (3.0, -3.0), 18: (0.0, 3.0)}
-SWARM_YAML_RANGES_LIVE = """
+ANCHORED = """
 fileversion: 1
 robots:
   alpha:
@@ -328,7 +326,7 @@ def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]
     path = tmp_path / "swarm.yaml"
     of_others = "topics: {<robot>/odom: lab/<robot>/odometry/filtered, alpha/ranges: /radios/first}"
     named = "" if topics["ranges"] == "alpha/ranges" else of_others
-    path.write_text(f"{SWARM_YAML_RANGES_LIVE}{named}\n", encoding="utf-8")
+    path.write_text(f"{ANCHORED}{named}\n", encoding="utf-8")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
     odometry = ros.tester.create_publisher(Odometry, topics["odom"], 100)
     ranges = ros.tester.create_publisher(RangeArray, topics["ranges"], 100)
@@ -342,7 +340,7 @@ def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]
 def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> None:
     """The topics have names of radios, in both orders, as the drivers of tags and of anchors publish them."""
     path = tmp_path / "swarm.yaml"
-    named = SWARM_YAML_RANGES_LIVE.replace("{address: 1,", "{address: 1, name: tag,").replace(
+    named = ANCHORED.replace("{address: 1,", "{address: 1, name: tag,").replace(
         "address: 16,", "address: 16, name: west,"
     )
     path.write_text(f"{named}range_topic: /uwb/n_{{from}}/n_{{to}}/distance\n", encoding="utf-8")
@@ -363,6 +361,6 @@ def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> 
 def test_a_topic_that_ros_refuses_is_a_mistake_of_the_user(tmp_path: Path) -> None:
     """Tokens of topics must not begin with a digit."""
     path = tmp_path / "swarm.yaml"
-    path.write_text(f"{SWARM_YAML_RANGES_LIVE}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
+    path.write_text(f"{ANCHORED}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
     with pytest.raises(InvalidTopicNameException, match="must not start with a number"):
         EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True))

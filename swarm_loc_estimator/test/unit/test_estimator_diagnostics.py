@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_messages import odometry_bytes
+from core_messages import SECOND, odometry_bytes
 
 from swarm_loc_estimator.common.health import PATIENCE_S, THROTTLE_S, Health, drop_values, listed
 from swarm_loc_estimator.common.messages.cdr import RANGE, encode
@@ -20,7 +20,6 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimate import LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
-SECOND = 1_000_000_000
 SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))
 
 

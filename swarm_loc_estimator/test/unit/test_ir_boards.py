@@ -135,7 +135,7 @@ def test_a_board_that_knows_of_stray_light_is_less_overconfident(seed: int) -> N
     assert np.mean(nees[0.06]) < 0.6 * np.mean(nees[0.0])
 
 
-ROBOTS_READING_LIMITS, N = 3, 6
+TRIO, N = 3, 6
 NEVER = 1e8  # A saturation that nothing reaches [count]
 ROUNDED = 1.0 / np.sqrt(12.0)  # Noise of whole counts [count]
 
@@ -165,22 +165,18 @@ def exchanged(
     stretches = -(-course.count // course.stay)
     poses = random_poses(stretches, seed, course.nearest, course.farthest)
     stretch = np.repeat(np.arange(stretches), course.stay)[: course.count]
-    first = rng.integers(0, ROBOTS_READING_LIMITS, stretches)
+    first = rng.integers(0, TRIO, stretches)
     receiver = first[stretch]
-    transmitter = ((first + rng.integers(1, ROBOTS_READING_LIMITS, stretches)) % ROBOTS_READING_LIMITS)[
-        stretch
-    ]
+    transmitter = ((first + rng.integers(1, TRIO, stretches)) % TRIO)[stretch]
     moved = poses[stretch] + course.walk * rng.standard_normal((course.count, 3)) * [1.0, 10.0, 10.0]
-    factors = np.exp(platform.element_sigma * rng.standard_normal((2, ROBOTS_READING_LIMITS, N)))
+    factors = np.exp(platform.element_sigma * rng.standard_normal((2, TRIO, N)))
     gains = PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((course.count, 4)))
     lasting = np.exp(platform.curve_sigma * rng.standard_normal((stretches, N, N)))
     lasting *= rng.uniform(size=lasting.shape) > platform.blocked_share
     light = expected_brightness(platform, moved, gains)[:, 0] * lasting[stretch]
     light *= 1.0 + platform.relative_noise * rng.standard_normal(light.shape)
     light += platform.noise * rng.standard_normal(light.shape)
-    limit = np.broadcast_to(
-        platform.saturation if saturation is None else saturation, (ROBOTS_READING_LIMITS, N)
-    )
+    limit = np.broadcast_to(platform.saturation if saturation is None else saturation, (TRIO, N))
     readings = np.rint(np.minimum(light, limit[receiver][..., None]))[:, None]
     unknown = np.full((course.count, 3), np.nan)
     return Exchanges(
@@ -191,13 +187,13 @@ def exchanged(
 def limits_of(
     platform: IrPlatform, course: Course, seed: int, saturation: FloatArray | float | None = None
 ) -> ReadingLimits:
-    return find_reading_limits(platform, ROBOTS_READING_LIMITS, exchanged(platform, course, seed, saturation))
+    return find_reading_limits(platform, TRIO, exchanged(platform, course, seed, saturation))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_sensors_that_saturate_are_found_each_at_its_own_count(seed: int) -> None:
     """Every other one saturates at a lower count."""
-    true = np.where(np.arange(ROBOTS_READING_LIMITS * N).reshape(ROBOTS_READING_LIMITS, N) % 2, 255.0, 180.0)
+    true = np.where(np.arange(TRIO * N).reshape(TRIO, N) % 2, 255.0, 180.0)
     found = limits_of(board("droplet"), Course(stay=1), seed, true).saturation
     np.testing.assert_allclose(found, true, rtol=0.005)
 
@@ -206,10 +202,10 @@ def test_sensors_that_saturate_are_found_each_at_its_own_count(seed: int) -> Non
 def test_sensors_of_real_boards_are_found_where_enough_geometries_saturate_them(seed: int) -> None:
     course = Course(1500, stay=1, nearest=0.044)
     exchanges = exchanged(board("droplet_2016"), course, seed)
-    found = find_reading_limits(board("droplet_2016"), ROBOTS_READING_LIMITS, exchanges).saturation
+    found = find_reading_limits(board("droplet_2016"), TRIO, exchanges).saturation
     exchange, sensor, _ = np.nonzero(exchanges.readings[:, 0] >= board("droplet_2016").saturation)
-    often = np.zeros((ROBOTS_READING_LIMITS, N), dtype=np.bool_)
-    for robot, i in np.ndindex(ROBOTS_READING_LIMITS, N):
+    often = np.zeros((TRIO, N), dtype=np.bool_)
+    for robot, i in np.ndindex(TRIO, N):
         rows = np.unique(exchange[(exchanges.receiver[exchange] == robot) & (sensor == i)])
         emitters = exchanges.readings[rows, 0, i].argmax(axis=1) + N * exchanges.transmitter[rows]
         often[robot, i] = rows.size >= 5 and np.unique(emitters).size >= 3
@@ -259,7 +255,7 @@ def test_readings_that_fail_now_and_then_are_no_noise() -> None:
     chance = rng.uniform(size=exchanges.readings.shape)
     exchanges.readings[chance < 1 / 360] = 0.0
     exchanges.readings[chance > 359 / 360] += 300.0
-    ratio = find_reading_limits(platform, ROBOTS_READING_LIMITS, exchanges).noise / platform.noise
+    ratio = find_reading_limits(platform, TRIO, exchanges).noise / platform.noise
     assert np.abs(ratio - 1.0).max() < 0.25
 
 
@@ -274,7 +270,7 @@ def test_a_sensor_that_never_sees_light_says_nothing_wrong(dark: float) -> None:
     """It reads nothing, or less than is read in the dark."""
     exchanges = exchanged(board("droplet"), Course(1500), 9)
     exchanges.readings[:, :, 2] = dark + np.random.default_rng(9).integers(-2, 3, (1500, 1, N))
-    found = find_reading_limits(board("droplet"), ROBOTS_READING_LIMITS, exchanges)
+    found = find_reading_limits(board("droplet"), TRIO, exchanges)
     assert np.isnan(found.saturation[:, 2]).all()
     assert np.isnan(found.relative_noise[:, 2]).all()
     others = np.delete(found.noise, 2, axis=1)
@@ -286,17 +282,17 @@ def test_a_sensor_that_never_sees_light_says_nothing_wrong(dark: float) -> None:
 def test_a_board_that_is_as_described_is_not_contradicted(seed: int) -> None:
     for name in ("droplet", "droplet_2016"):
         exchanges = exchanged(board(name), Course(1500), seed)
-        limits = find_reading_limits(board(name), ROBOTS_READING_LIMITS, exchanges)
+        limits = find_reading_limits(board(name), TRIO, exchanges)
         assert contradictions(board(name), exchanges, limits, ("a", "b", "c")) == []
 
 
 def test_what_contradicts_the_description_is_said_in_a_sentence_each() -> None:
     described = replace(board("droplet"), dark_level=0.4)
     truly = replace(described, noise=4.0, relative_noise=0.12)
-    true = np.full((ROBOTS_READING_LIMITS, N), NEVER)
+    true = np.full((TRIO, N), NEVER)
     true[1] = 150.0
     exchanges = exchanged(truly, Course(3000, stay=3, nearest=0.12), 8, true)
-    limits = find_reading_limits(described, ROBOTS_READING_LIMITS, exchanges)
+    limits = find_reading_limits(described, TRIO, exchanges)
     saturation, noise, relative = contradictions(described, exchanges, limits, ("a", "b", "c"))
     assert saturation == (
         "Sensors saturate lower than board and matrices say: b [0, 1, 2, 3, 4, 5] at 150 of 255 counts."
@@ -395,23 +391,20 @@ def test_a_dim_spot_is_no_measure_of_the_others() -> None:
     assert found.sigma == pytest.approx(0.01)
 
 
-ROBOTS_DEAD_ELEMENTS, N = 3, 6
 Faults = dict[tuple[int, int, int], float]
 """The share of its light that an element still gives, by side, robot and number."""
 
 
-def exchanged_dead_elements(
-    count: int, seed: int, faults: Faults, poses: FloatArray | None = None
-) -> Exchanges:
+def exchanged_with(count: int, seed: int, faults: Faults, poses: FloatArray | None = None) -> Exchanges:
     """Robots that stand elsewhere at every exchange; readings are blocked as often as the board says.
 
     In every tenth exchange a whole sensor is dark, as behind a third robot.
     """
     rng = np.random.default_rng(seed)
-    receiver = rng.integers(0, ROBOTS_DEAD_ELEMENTS, count)
-    transmitter = (receiver + rng.integers(1, ROBOTS_DEAD_ELEMENTS, count)) % ROBOTS_DEAD_ELEMENTS
+    receiver = rng.integers(0, TRIO, count)
+    transmitter = (receiver + rng.integers(1, TRIO, count)) % TRIO
     poses = random_poses(count, seed, 0.05, 0.2) if poses is None else poses
-    factors = np.exp(PLATFORM.element_sigma * rng.standard_normal((2, ROBOTS_DEAD_ELEMENTS, N)))
+    factors = np.exp(PLATFORM.element_sigma * rng.standard_normal((2, TRIO, N)))
     for place, share in faults.items():
         factors[place] *= share
     gains = PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((count, 4)))
@@ -435,27 +428,27 @@ def drawn(seed: int) -> Faults:
 @functools.cache
 def found(count: int, seed: int) -> tuple[Exchanges, ElementVerdicts]:
     """Exchanges of robots with drawn faults, and what is found."""
-    exchanges = exchanged_dead_elements(count, seed, drawn(seed))
-    return exchanges, find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, exchanges)
+    exchanges = exchanged_with(count, seed, drawn(seed))
+    return exchanges, find_dead_elements(PLATFORM, TRIO, exchanges)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_dead_and_shaded_elements_are_found_and_no_others(seed: int) -> None:
     faults, (_, verdicts) = drawn(seed), found(400, seed)
     assert set(zip(*(side.tolist() for side in np.nonzero(verdicts.dead)), strict=True)) == set(faults)
-    few = find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, exchanged_dead_elements(60, seed, faults))
+    few = find_dead_elements(PLATFORM, TRIO, exchanged_with(60, seed, faults))
     assert verdicts.undecided.sum() < few.undecided.sum()
 
 
 @pytest.mark.parametrize("seed", range(10, 15))
 def test_where_all_work_none_is_named(seed: int) -> None:
-    verdicts = find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, exchanged_dead_elements(400, seed, {}))
+    verdicts = find_dead_elements(PLATFORM, TRIO, exchanged_with(400, seed, {}))
     assert not verdicts.dead.any()
     assert verdicts.works.mean() > 0.5
 
 
 def test_few_exchanges_decide_nothing() -> None:
-    verdicts = find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, exchanged_dead_elements(6, 1, drawn(1)))
+    verdicts = find_dead_elements(PLATFORM, TRIO, exchanged_with(6, 1, drawn(1)))
     assert verdicts.undecided.all()
 
 
@@ -463,9 +456,9 @@ def test_few_exchanges_decide_nothing() -> None:
 def test_one_geometry_says_little_however_often_it_was_measured(seed: int) -> None:
     """Something that stands between two robots darkens the same sensor every time."""
     facing = np.tile([0.1, PLATFORM.angles[0], 0.0], (100, 1))
-    exchanges = exchanged_dead_elements(100, seed, {}, facing)
+    exchanges = exchanged_with(100, seed, {}, facing)
     exchanges.readings[:, :, 0] = PLATFORM.noise * np.random.default_rng(seed).standard_normal((100, 1, N))
-    assert not find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, exchanges).dead.any()
+    assert not find_dead_elements(PLATFORM, TRIO, exchanges).dead.any()
 
 
 def test_readings_of_dead_elements_are_left_out() -> None:
@@ -481,6 +474,6 @@ def test_the_order_of_robots_does_not_matter(order: tuple[int, ...]) -> None:
     """All orders of three follow from an exchange of two and a cycle."""
     (exchanges, one), places = found(120, 3), np.array(order)
     other = exchanges._replace(receiver=places[exchanges.receiver], transmitter=places[exchanges.transmitter])
-    two = find_dead_elements(PLATFORM, ROBOTS_DEAD_ELEMENTS, other)
+    two = find_dead_elements(PLATFORM, TRIO, other)
     np.testing.assert_array_equal(one.dead, two.dead[:, places])
     np.testing.assert_array_equal(one.works, two.works[:, places])

@@ -26,7 +26,7 @@ from swarm_loc_estimator.common.messages.streams import MessageBatch, Serialized
 from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.nodes.load import Thinning
-from swarm_loc_estimator.nodes.mapper_precompile import precompile as precompile_mapper_precompile
+from swarm_loc_estimator.nodes.mapper_precompile import precompile as precompile_mapper
 from swarm_loc_estimator.offline.map_replay import replay_map
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import Size, precompile, size_of
@@ -311,24 +311,24 @@ def compiled_late(size: Size) -> list[str]:
     before = signatures()
     eight = BAGS / "eight_five_robots"
     if size == "sparse":
-        run_precompile(eight, Settings(sparse_from=2))
-        run_precompile(eight, Settings(sparse_from=2), relayed=True)
-        run_precompile(BAGS / "droplets_twenty", Settings(sparse_from=2))
+        estimate(eight, Settings(sparse_from=2))
+        estimate(eight, Settings(sparse_from=2), relayed=True)
+        estimate(BAGS / "droplets_twenty", Settings(sparse_from=2))
     elif size == "large":
         together = Settings(fusion_period_s=0.1, policy=Policy(large_from=2))
         for name in RECORDED:
-            run_precompile(BAGS / name, together)
-        run_precompile(eight, together, relayed=True)
+            estimate(BAGS / name, together)
+        estimate(eight, together, relayed=True)
     else:
         for name in RECORDED:
-            run_precompile(BAGS / name, Settings(policy=Policy(large_from=100)))
-        run_precompile(eight, Settings(), late=True)
-        run_precompile(eight, Settings(), moved_landmarks=True)
-        run_precompile(eight, Settings(), relayed=True)
+            estimate(BAGS / name, Settings(policy=Policy(large_from=100)))
+        estimate(eight, Settings(), late=True)
+        estimate(eight, Settings(), moved_landmarks=True)
+        estimate(eight, Settings(), relayed=True)
     return compiled_since(before)
 
 
-def run_precompile(
+def estimate(
     bag: Path, settings: Settings, *, late: bool = False, moved_landmarks: bool = False, relayed: bool = False
 ) -> None:
     """Estimate the beginning of a bag as the node does; relayed: by shared topics, half of it left out."""
@@ -390,8 +390,8 @@ def test_nothing_is_compiled_once_robots_report() -> None:
     assert printed_by_process(__file__) == []
 
 
-def compiled_late_mapper_precompile() -> list[str]:
-    precompile_mapper_precompile()
+def compiled_late_by_mapper() -> list[str]:
+    precompile_mapper()
     before = signatures()
     swarm = load_swarm(BAG / "swarm.yaml")
     with TemporaryDirectory() as folder:
@@ -408,12 +408,12 @@ def compiled_late_mapper_precompile() -> list[str]:
 
 
 if __name__ == "__main__":
-    late = compiled_late(cast("Size", sys.argv[1])) if sys.argv[1:] else compiled_late_mapper_precompile()
+    late = compiled_late(cast("Size", sys.argv[1])) if sys.argv[1:] else compiled_late_by_mapper()
     json.dump(late, sys.stdout)
 
 
 PACKAGE = Path(__file__).parents[2]
-BAG_WHEEL = PACKAGE.parent / "bags" / "eight_one_robot_fast"
+FAST = PACKAGE.parent / "bags" / "eight_one_robot_fast"
 BUILD = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
 SWARM_LOC = """
 import sys
@@ -486,7 +486,7 @@ def test_it_has_one_program_and_the_license(wheel: ZipFile) -> None:
 
 def test_it_replays_a_bag_with_its_plots_without_ros(wheel: ZipFile, tmp_path: Path) -> None:
     wheel.extractall(tmp_path / "site")
-    shutil.copytree(BAG_WHEEL, tmp_path / "bag")
+    shutil.copytree(FAST, tmp_path / "bag")
     out = tmp_path / "out"
     code = "status = run('replay', *sys.argv[1:]); print(swarm_loc.__globals__['__file__']); sys.exit(status)"
     done = python(code, str(tmp_path / "bag"), "--out", str(out), path=tmp_path / "site")
@@ -523,14 +523,14 @@ def test_commands_run_without_ros_and_the_others_say_that_they_need_it() -> None
 
 @pytest.mark.parametrize("name", ["graph", "watch"])
 def test_commands_that_start_nodes_say_so_once_they_start_them(name: str) -> None:
-    done = python("sys.exit(run(*sys.argv[1:]))", name, str(BAG_WHEEL / "swarm.yaml"))
+    done = python("sys.exit(run(*sys.argv[1:]))", name, str(FAST / "swarm.yaml"))
     assert done.returncode == 1
     (sentence,) = done.stderr.splitlines()
     assert sentence.startswith(f"swarm-loc {name} needs ROS 2")
 
 
 def test_a_bag_without_the_libraries_for_bags_ends_with_one_sentence() -> None:
-    done = python("sys.exit(run(*sys.argv[1:]))", "replay", str(BAG_WHEEL), refused="rosbags mcap")
+    done = python("sys.exit(run(*sys.argv[1:]))", "replay", str(FAST), refused="rosbags mcap")
     assert done.returncode == 1
     assert done.stderr == (
         "swarm-loc replay needs the Python package rosbags, which is not installed:"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import nees, wrapped
-from core_messages import odometry_bytes
+from core_messages import SECOND, odometry_bytes
 from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, room_map, scan_bytes
 from numpy.typing import NDArray
 
@@ -354,9 +354,6 @@ def test_scans_of_one_stamp_and_after_a_gap_are_not_compared() -> None:
     there, track = np.array([9.0, 9.0, 0.0]), belief.track
     for stamp_ns in (belief.stamp_ns, belief.stamp_ns + 2_000_000_000):
         assert (learned_delay(belief, stamp_ns, there, COVARIANCE, track).chance == belief.chance).all()
-
-
-SECOND = 1_000_000_000
 
 
 def without_start(room: Path) -> Swarm:

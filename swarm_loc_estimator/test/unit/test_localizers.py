@@ -239,7 +239,7 @@ def test_a_wrong_parameter_is_named(parameters: dict[str, Any], said: str) -> No
 
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
-ROBOTS_BAG_LOCALIZER = ("epuck1", "epuck2")
+EPUCKS = ("epuck1", "epuck2")
 BODIES = ("cf1=epuck1", "cf2=epuck2")
 
 
@@ -258,12 +258,12 @@ def bodies(source: str, name: str, header: Any, pose: Any) -> tuple[str, dict[st
 def recorded(bag: Path, source: str) -> None:
     """Odometry of two robots for 15 s, and their ground truth as motion capture."""
     with BagReader(BAG) as reader, BagWriter(bag) as writer:
-        for robot in ROBOTS_BAG_LOCALIZER:
+        for robot in EPUCKS:
             writer.add_topic(f"{robot}/odom", "nav_msgs/msg/Odometry")
         kind = SOURCES[source].message_type
         for body in ("cf1", "cf2") if source == "pose" else ("",):
             writer.add_topic(SOURCES[source].topic.replace(BODY, body).lstrip("/"), kind)
-        wanted = [f"{robot}/{topic}" for robot in ROBOTS_BAG_LOCALIZER for topic in ("odom", "ground_truth")]
+        wanted = [f"{robot}/{topic}" for robot in EPUCKS for topic in ("odom", "ground_truth")]
         for name, _, log_ns, data in reader.messages(wanted):
             if log_ns > reader.time_range_ns[0] + 15e9:
                 break
@@ -277,7 +277,7 @@ def recorded(bag: Path, source: str) -> None:
 
 def swarm(source: str, output: str) -> Swarm:
     localizer = Localizer(source, output=output, bodies=BODIES)
-    return Swarm(tuple(Robot(name, camera=None) for name in ROBOTS_BAG_LOCALIZER), localizer=localizer)
+    return Swarm(tuple(Robot(name, camera=None) for name in EPUCKS), localizer=localizer)
 
 
 @pytest.mark.parametrize("source", ["pose", "tf", "named_poses"])
@@ -291,7 +291,7 @@ def test_motion_capture_in_a_bag_locates_robots(tmp_path: Path, source: str) -> 
     with BagReader(BAG) as reader:
         log_ns = [log_ns for _, _, log_ns, _ in reader.messages(["epuck1/ground_truth"])]
     assert {len(track.stamp_ns) for track in judged.truth.values()} == {151} != {len(log_ns)}
-    for index, name in enumerate(ROBOTS_BAG_LOCALIZER):
+    for index, name in enumerate(EPUCKS):
         track = judged.truth[name]
         known = np.isfinite(fixed.poses[:, index, 0])
         true = np.stack(

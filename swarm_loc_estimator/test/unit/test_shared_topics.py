@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_messages import big_endian, odometry_bytes
+from core_messages import SECOND, big_endian, odometry_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -225,7 +225,6 @@ def test_a_robot_cannot_flood_the_memory_of_all() -> None:
     assert inputs.dropped == {"shared_too_many": 1001}
 
 
-SECOND = 1_000_000_000
 T0 = 1_000 * SECOND
 SWARM_CHANNELS = Swarm((Robot("a", odometry=OdometryModel(wheel_noise=1e-6)), Robot("b", stands=True)))
 NAMES = st.sampled_from(["", "a", "ab/base_link", "r\u00f6/base_link"])

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from core_messages import big_endian
+from core_messages import SECOND, big_endian
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,7 +36,6 @@ from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 Pose = tuple[float, float, float]
-SECOND = 10**9
 FRAMES = st.sampled_from(["", "a", "ab/odom", "robot17/odom", "r\u00f6/camera"])
 
 

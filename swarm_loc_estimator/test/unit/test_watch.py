@@ -18,7 +18,7 @@ from xml.etree import ElementTree as ET
 import aiohttp
 import numpy as np
 import pytest
-from core_messages import odometry_bytes
+from core_messages import SECOND, odometry_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from page_frames import unpack
@@ -52,7 +52,6 @@ from swarm_loc_estimator.watch.server import (
     WrongTokens,
 )
 
-SECOND = 1_000_000_000
 MEGABYTE = 1 << 20
 
 
