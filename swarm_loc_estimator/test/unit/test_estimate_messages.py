@@ -77,7 +77,8 @@ def test_swarm_poses_are_read_whoever_is_in_them(swarms: list[list[str]], seed: 
     for names in swarms * 2:
         one = estimate_of(names, seed)
         data = SwarmPosesEncoder(names, "map").encode(one.stamp_ns, *one[3:])
-        found, official = reader.read(data), typestore().deserialize_cdr(data, SWARM_POSES)
+        found = reader.read(data)
+        official: Any = typestore().deserialize_cdr(data, SWARM_POSES)
         assert found[:3] == one[:3]
         assert [robot.name for robot in official.robots] == names
         for k, robot in enumerate(official.robots):

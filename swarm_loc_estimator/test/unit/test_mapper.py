@@ -463,7 +463,7 @@ def heading_by_lights(
 
 def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
     """Both stand; the second sees nothing but the first one's light, and learns its heading."""
-    bearing, turn = math.radians(6.0), np.minimum(0.02 * np.arange(199), 1.0)
+    bearing, turn = math.radians(6.0), np.minimum(0.02 * np.arange(199.0), 1.0)
     seen = (np.arange(199) >= 100) & (np.arange(199) < 150)
     angle = np.full(50, np.pi - bearing - 1.0)  # it has turned by one radian
     found = heading_by_lights(CooperativeMapper(), np.array([2.0, 0.0, 0.0]), turn, seen, angle)
@@ -474,7 +474,7 @@ def test_a_light_seen_twice_in_one_scan_of_wheels_that_slip_is_in_one_direction(
     """By odometry the second time is a third of a radian more than a full turn after the first one."""
     slip, off, ahead = 0.05, math.radians(6.0), 4.0 * math.pi + 0.3
     mapper = CooperativeMapper(MapperSettings(usual_slip=slip, slip_sigma=1e-4))
-    heading, turn = math.pi - (1.0 - slip) * ahead, 0.02 * np.arange(1, 1000)
+    heading, turn = math.pi - (1.0 - slip) * ahead, 0.02 * np.arange(1.0, 1000.0)
     again = ahead + 2.0 * math.pi / (1.0 - slip)
     seen = (np.abs(turn - ahead) < 0.15) | (np.abs(turn - again) < 0.4)
     bearing = wrap_angle((1.0 - slip) * (ahead - turn[seen]))

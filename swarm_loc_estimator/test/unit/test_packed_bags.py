@@ -219,7 +219,8 @@ def test_profiles_of_all_versions(profiles: object) -> None:
 def test_damaged_profiles_and_topics_are_none() -> None:
     for profiles in ("]", "reliable", [{"depth": 1}], [3], 7, [{**NEW, "deadline": None}]):
         assert offered_qos(_metadata(profiles)) == {"b/odom": []}
-    for topics in (None, 7, [None], [{"topic_metadata": 3}], [{"topic_metadata": {}}]):
+    wrong: list[Any] = [None, 7, [None], [{"topic_metadata": 3}], [{"topic_metadata": {}}]]
+    for topics in wrong:
         assert offered_qos({"topics_with_message_count": topics}) == {}
 
 
