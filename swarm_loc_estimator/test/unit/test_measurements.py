@@ -107,7 +107,8 @@ def test_jacobians_of_all_models_agree_with_finite_differences(
     number: int, who: str, heading: int, seed: int
 ) -> None:
     model, rng, step = MODELS[number], np.random.default_rng(seed), 1e-6
-    one = measurement(who, number, *rng.normal(size=(2, 3)), heading)
+    sensor, marker = rng.normal(size=(2, 3))
+    one = measurement(who, number, sensor, marker, heading)
     one.height[:], one.reference[:] = rng.normal(size=one.height.shape), rng.normal(size=one.reference.shape)
     poses, row = rng.normal(size=(2, 3)), one.row(0)
     predicted = model.predicted(row, *poses)
