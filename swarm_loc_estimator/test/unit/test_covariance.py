@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.numerics import cholesky3, solve3
 from swarm_loc_estimator.filter.joint_filter import DenseFilter, update_one
 
 
@@ -128,3 +129,12 @@ def test_placing_makes_columns_independent() -> None:
     assert not dense.covariance[3:6, :3].any()
     assert not dense.covariance[6:, 3:6].any()
     np.testing.assert_array_equal(dense.covariance[:3, 6:], before[:3, 6:])
+
+
+def test_the_small_cholesky_solves() -> None:
+    rng = np.random.default_rng(0)
+    matrix, right, out = covariance(rng, 3), rng.standard_normal(3), np.empty(3)
+    factor = cholesky3(matrix)
+    np.testing.assert_allclose(factor, np.linalg.cholesky(matrix), atol=1e-12)
+    solve3(factor, right, out)
+    np.testing.assert_allclose(out, np.linalg.solve(matrix, right), atol=1e-12)

@@ -16,7 +16,7 @@ from test_lidar_in_map import CELL, hand_in, sent, swarm_at
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, encode
-from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.se2 import compose, inverse, transform_points, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, map_of_message, save_map
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
@@ -257,6 +257,22 @@ def test_a_match_finds_the_pose(shift: tuple[float, float, float], heading: floa
     assert float(wrap_angle(found.pose[2] - heading)) == pytest.approx(0.0, abs=0.01)
     assert found.fitting > 0.95
     assert found.through == 0.0
+
+
+@given(st.integers(0, 3), st.integers(-40, 40), st.integers(-40, 40))
+def test_matching_commutes_with_transforms(quarters: int, right: int, up: int) -> None:
+    room = room_map(CELL)
+    turn = np.array([right * CELL, up * CELL, quarters * 0.5 * math.pi])
+    extent = np.array(room.log_odds.shape) * CELL
+    corners = transform_points(turn, np.array([room.corner, room.corner + extent]))
+    moved = OccupancyMap(corners.min(axis=0), CELL, np.ascontiguousarray(np.rot90(room.log_odds, quarters)))
+    ends, start = beams(HERE), HERE + np.array([0.06, -0.08, 0.05])
+    one = matched(wall_map(room, Path("a")), ends, start)
+    other = matched(wall_map(moved, Path("a")), ends, compose(turn, start))
+    assert compose(inverse(turn), other.pose) == pytest.approx(one.pose, abs=2e-3)
+    rotation = np.eye(3)
+    rotation[:2, :2] = [[math.cos(turn[2]), -math.sin(turn[2])], [math.sin(turn[2]), math.cos(turn[2])]]
+    assert other.covariance == pytest.approx(rotation @ one.covariance @ rotation.T, rel=0.2, abs=1e-5)
 
 
 @pytest.mark.parametrize("beam", range(3, 360, 31))

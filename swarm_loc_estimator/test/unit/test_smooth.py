@@ -321,6 +321,19 @@ def test_covariances_are_those_of_many_worlds() -> None:
     assert 2.4 < np.mean(normalized) < 3.6
 
 
+def test_the_inverse_in_the_band_is_that_of_the_whole_matrix() -> None:
+    rng = np.random.default_rng(1)
+    normal = ChainEquations(12, 4, 3)
+    for k in range(9):
+        columns = np.array([[k, k + 2, k + 3, 12 + k % 3]])
+        normal.add(rng.standard_normal((1, 5, 4)), columns, np.zeros((1, 5)))
+    factor = normal.factored(0.0)
+    whole = factor.covariance(np.arange(15))
+    band = factor.inverse_band()
+    for d in range(5):
+        np.testing.assert_allclose(band[d, : 12 - d], np.diag(whole, -d)[: 12 - d], rtol=1e-8, atol=1e-10)
+
+
 def test_looks_from_one_place_count_less() -> None:
     """A robot that stands sees the same landmarks with errors that repeat; one that drives does not."""
     world = simulate(replace(PLAN, robots=2, standing=(0,), noise=0.0), 2)

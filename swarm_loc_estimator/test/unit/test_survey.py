@@ -17,6 +17,9 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.offline.batch.problem import SURVEY, problem_of
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     Recording,
@@ -325,6 +328,24 @@ def test_what_cannot_be_surveyed_is_said_in_a_sentence() -> None:
         survey(replace(recording, odometry=NO_ODOMETRY), world.swarm)
     with pytest.raises(CalibrationError, match="no marker that belongs to nobody"):
         survey(replace(recording, detections=NO_DETECTIONS), unplaced(world.swarm))
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    world = simulate(PLAN, 1)
+    problem = problem_of(recording_of(world), unplaced(world.swarm), SURVEY)
+    solver = Solver(problem, start_of(problem))
+    solver.solve(lambda _share, _what: None)
+    rng = np.random.default_rng(0)
+    normal, _ = solver._normal(1e6)  # without weights
+    solver._apply(rng.standard_normal(normal.gradient.size) / np.sqrt(normal.diagonal()))  # off the minimum
+    normal, _ = solver._normal(1e6)
+    step = 1e-3 * normal.gradient / normal.diagonal()
+    before, cost = (solver._knot, solver._landmark, solver._parameter), []
+    for sign in (1.0, -1.0):
+        solver._apply(sign * step)
+        cost.append(solver._normal(1e6)[1])
+        solver._knot, solver._landmark, solver._parameter = before
+    assert cost[0] - cost[1] == pytest.approx(-4.0 * normal.gradient @ step, rel=1e-2)
 
 
 def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
