@@ -18,7 +18,7 @@ from typing import Protocol
 from typing_extensions import Self
 
 _CHUNK = 4096
-_MAX_CLIENTS = 9  # The firmware never closes a client socket, and has ten including the server
+_MAX_CLIENTS = 9  # Client sockets: the firmware closes none; it has ten, one of them for the server
 
 
 class ConsoleFirmware(Protocol):

@@ -162,7 +162,7 @@ class Evidence:
         return whole._replace(contradictions=named)
 
     def _estimated(self, from_ns: int, until_ns: int, starts: Sequence[bool]) -> Estimated:
-        """What the estimator makes of what arrived between two instants, by those starts (N,)."""
+        """What the estimator makes of what arrived between two instants, with some of the starts (N,)."""
         described = [
             robot if is_there else replace(robot, start=None)
             for robot, is_there in zip(self.swarm.robots, starts, strict=True)

@@ -40,7 +40,7 @@ from swarm_loc_estimator.infrared.search import (
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
-# The constants of the likelihood are checked by `make bench-droplet` and, outliers, test_ir_likelihood.py.
+# The constants of the likelihood are checked by `make bench-droplet` and test_ir_likelihood.py.
 _WORSE = 2.0  # Maximum misfit of a start relative to that of the best start
 _LOOSE, _STILL = 0.1, 1e-4  # Minimum predicted decrease of the cost per step, of the blurred and exact model
 _SAME = 0.02  # Maximum difference in cost of two searches that reached the same minimum

@@ -41,7 +41,7 @@ _TURN, _TURN_SHARE, _MAX_TURN = math.radians(30.0), 0.5, math.radians(50.0)
 """Search for its heading: turn [rad], share of the turn by odometry, and greatest [rad]."""
 _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 """Standard deviations of the prediction [m], per path, and of its heading [rad]."""
-_ANYWHERE = PoseWindow(2.5, math.pi, math.inf, math.inf)  # Search for one that does not fit the prediction
+_ANYWHERE = PoseWindow(2.5, math.pi, math.inf, math.inf)  # For a sweep that does not fit the prediction
 _GOOD, _LESS, _BETTER = 0.5, 0.8, 0.15
 """Score, and share of the usual one, below which it is searched elsewhere, and is there if so much better."""
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones

@@ -52,7 +52,7 @@ _RESTART_GAP = 2.5  # Pause before a restart at the origin, in previous steps
 _ROUNDING = 1e-9
 _UNMOVED_M, _UNMOVED_RAD = 0.02, 0.2  # Motion by the twist from which a constant pose is not believed
 _UNMOVED_ROWS = 3  # Minimum number of rows with that pose
-_UNMOVED_S = 10.0  # Time constant with which this motion is forgotten: a small bias of twists is none
+_UNMOVED_S = 10.0  # Time constant with which this motion is forgotten, so that a small bias does not add up
 
 
 @norefcount_njit

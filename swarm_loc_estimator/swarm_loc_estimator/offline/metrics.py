@@ -12,7 +12,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 
-MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02  # A position is misleading beyond both: standard deviations, [m]
+MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02  # A position is misleading beyond both [sigma], [m]
 
 
 class MetricsError(ValueError):

@@ -20,7 +20,7 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 NO_COVARIANCE = "fix_without_covariance"
 """Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
-_FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # Least covariance of a fix, whatever a message claims
+_FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # Least covariance of a fix, whatever it claims [m, m, rad]
 _GATE = float(MODELS[CARTESIAN].gate(0.9999))
 
 

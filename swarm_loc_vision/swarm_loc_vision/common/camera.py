@@ -78,7 +78,7 @@ _MOST_PX, _STRONGEST = 1e6, 1e4  # Bounds on intrinsics and on coefficients of t
 _MAX_OFF_AXIS = math.tan(math.radians(80.0))
 """Further off the axis a flat image is stretched too much to detect straight sides."""
 _ROUNDS, _EXACT_PX = 50, 1e-4
-_MAX_ERROR_PX = 0.01  # Largest error of an ideal pixel, projected back; beyond it there is none
+_MAX_ERROR_PX = 0.01  # Largest error of an ideal pixel, projected back; beyond, a pixel has no ideal one
 
 
 class CameraError(ValueError):

@@ -26,7 +26,7 @@ FALSE_READINGS = 1e-5
 """Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
 second threshold increase it: with all 4096 ids to one or two of 100 000 random squares."""
 _SHARPENING = 0.2  # Share of the difference to each of its four neighbours that is added to a cell
-_MAX_DARK_ERRORS = 3.0  # Maximum number of light cells in the border's inner ring, of 16 or more
+_MAX_DARK_ERRORS = 3.0  # Maximum number of light cells among the 16 or more of the border's inner ring
 _MAX_SLOPE = 0.5  # Maximum difference of the border's brightness between its sides, relative to the contrast
 _MIDDLE, _LOW = 0.5, 0.28  # Between ink and paper: the default, and that of a marker half in shadow
 _MIN_CORRELATION = 0.4

@@ -23,7 +23,7 @@ from swarm_loc_vision.markers.detector import Detections, MarkersInUse, detectio
 from swarm_loc_vision.markers.families import families
 from swarm_loc_vision.markers.pose import SHIFT, PoseSettings, PoseSolver, square
 
-_APRILTAG_CENTRE_PX = 0.5  # Where AprilTag's detector sees the centre of the first pixel; else it is at 0
+_APRILTAG_CENTRE_PX = 0.5  # Where AprilTag's detector sees the centre of the first pixel; others: at 0
 _APRILTAG_NAMES = {
     "apriltag_16h5": "tag16h5",
     "apriltag_25h9": "tag25h9",

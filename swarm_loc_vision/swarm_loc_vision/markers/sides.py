@@ -35,7 +35,7 @@ REACH_PX, INNER_REACH_PX, _SHARP_REACH_PX = 7.0, 3.5, 4.0
 turns out to be sharp enough for fewer pixels."""
 _MAX_ROWS = 32  # Maximum number of rows or columns of pixels across a side; spread evenly over longer sides
 _ROOM = 4 * (_MAX_ROWS + 1) * (2 * math.ceil(math.sqrt(2.0) * (REACH_PX + INNER_REACH_PX)) + 4)
-_NODES = 6  # Points at a side whose shift is computed: start, middle, end, and each a pixel outside
+_NODES = 6  # Points whose shift is computed: start, middle and end of a side, and a pixel outside each
 U, V, DU, DV, LENGTH, NEAR, FAR, SHEAR = range(8)
 
 

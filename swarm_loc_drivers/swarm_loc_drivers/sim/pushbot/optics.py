@@ -112,7 +112,7 @@ def led_pixel(observer: FloatArray, pose: FloatArray, *, front: bool) -> tuple[f
 
 BODY_RADIUS_M = 0.07
 _MAX_SPOT_M = 5.0  # The laser is invisible beyond this distance
-_BEFORE_WALL = 1e-3  # Corners are part of walls: visibility is tested nearer by this share
+_BEFORE_WALL = 1e-3  # Corners are on walls: visibility is tested nearer to the camera by this share
 _CONTRAST = 0.6  # Share of the pixels along an upright edge that notice it
 
 Lights = tuple[Blinking, Blinking, Blinking]  # Laser, rear and front LED of a robot

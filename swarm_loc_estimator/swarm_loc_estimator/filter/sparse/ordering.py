@@ -405,7 +405,7 @@ def spread(places: FloatArray, count: int) -> IntArray:
 
 
 _ORDERED_AGAIN = 3  # Number of updates after which an order is replaced
-_GROWN = 1.2  # Growth of the largest front by which it is replaced before
+_GROWN = 1.2  # Growth of its largest front at which it is replaced earlier
 _NEAR_AGAIN = 9  # Number of updates after which near pairs are computed again
 
 

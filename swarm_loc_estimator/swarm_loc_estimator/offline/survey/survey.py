@@ -357,7 +357,7 @@ _ONE_SIDE = math.radians(45.0)  # Landmarks seen from directions within less tha
 _WRONG = 0.3  # Share of sightings that contradict a landmark from which it is named
 _VAGUE_M, _VAGUE = 0.01, 3.0
 """A landmark is named if its sigma exceeds this [m] and this multiple of the median sigma."""
-_WORSE = 1.5  # One that was seen from one side is named if its sigma exceeds the median sigma so often
+_WORSE = 1.5  # One that was seen from one side is named if its sigma exceeds the median by this factor
 _SCALE = [(one.section, one.name) for one in SURVEY].index(("sensor", "distance_scale"))
 _POLAR_SIGMA = 0.1  # Standard deviation of scales of cameras that measure ranges and bearings
 _LOOSE = (("odometry", "distance_scale"), ("sensor", "distance_scale"), ("sensor", "range_offset"))

@@ -390,7 +390,7 @@ are sometimes dark, and yields worse results on other recordings: 10.6 instead o
 MIN_EXCHANGES = 100  # Minimum number of exchanges with ground truth
 BLOCKS = 3
 _STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)  # Candidate values of stray light
-_MISFIT = 3.0  # Maximum RMS residual of the initial platform, whose curves are wrong beyond [sigma]
+_MISFIT = 3.0  # Maximum RMS residual of the initial platform [sigma]; beyond, its curves are wrong
 _TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
 """Share of errors that must lie within the 99 % bound of the normal distribution; covariances are scaled."""
 _MAX_SCALE = 30.0

@@ -222,7 +222,7 @@ _SHOWS_MOTION = 10.0  # Minimum of the brightest reading of pairs tested for mot
 _MAX_CHANGE = 0.3  # Maximum change of a stationary pair beyond noise: relative root sum of squares
 _MOTIONS, _MOVED = 3, 0.05
 """Number of motion directions (range, bearing, heading); false alarm probability of the F test for motion."""
-_MIN_STANDING = 0.2  # Minimum share of stationary pairs; fewer may pass the test by chance
+_MIN_STANDING = 0.2  # Minimum share of stationary pairs; fewer may pass by chance while all robots move
 _MIN_READINGS = 60  # Minimum number of differences for the noise of a sensor
 _MIN_FREE = 0.2  # Minimum share of a change that motion cannot explain, for its use in the noise estimate
 _TRIM, _TRIMMED = 3.0, 0.9733
@@ -234,7 +234,7 @@ _TINY = 1e-300
 _FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3  # Initial noise: relative, and minimum [count]
 _LOWER, _FACTOR = 0.97, 1.5
 """Thresholds of a contradiction: saturation relative to the described one, and factor between noises."""
-_LEAST_RELATIVE = 0.05  # Least relative noise of a contradiction: small motions cause some percent of it
+_LEAST_RELATIVE = 0.05  # Least relative noise of a contradiction: small motions look like some percent
 
 
 @dataclass(frozen=True)
