@@ -121,6 +121,19 @@ class KinematicPushBot:
         reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)
         return self._moved(poses, reported, others)
 
+    def step(self, speed: float, rate: float, others: list[KinematicPushBot]) -> Readings:
+        """Move for `PERIOD_S` at a speed [m/s] and a rate [rad/s]; a body that is held only turns."""
+        noise, length, turn = self._noise, speed * PERIOD_S, rate * PERIOD_S
+        sigma = noise.turn * math.sqrt(abs(turn) / (2.0 * math.pi)) + noise.heading * math.sqrt(abs(length))
+        pose, reported = self.pose.copy(), self._odometry.copy()
+        true_turn = (1.0 - noise.slip) * turn + sigma * self._rng.standard_normal()
+        for moved, angle in ((pose, true_turn), (reported, turn)):
+            moved[:2] += length * np.array([math.cos(moved[2]), math.sin(moved[2])])
+            moved[2] += angle
+        if not _free_steps(self._plan.walls, self._discs(others, 1), self.pose, pose[None]):
+            pose[:2] = self.pose[:2]
+        return self._moved(pose[None], reported[None], others)
+
     def restart_odometry(self) -> None:
         """Begin odometry at zero, as a new driver does."""
         self._odometry = np.zeros(3)
@@ -170,7 +183,7 @@ class KinematicPushBot:
     def _inverse(self, distances: FloatArray) -> FloatArray:
         """Inverse distances (n,) that the tracker reports of true distances (n,)."""
         count, rng, noise = len(distances), self._rng, self._noise
-        pixels = FOCAL_BASELINE / distances + noise.pixel * rng.standard_normal(count)
+        pixels = FOCAL_BASELINE / np.maximum(distances, _NEAREST) + noise.pixel * rng.standard_normal(count)
         lowest = FOCAL_BASELINE / _FARTHEST
         nonsense = rng.random(count) < noise.outlier
         pixels = np.where(nonsense, rng.uniform(lowest, _MAX_PX, count), pixels)
@@ -296,7 +309,11 @@ class Exploration:
             self._feed(robot, body.turn(SCAN_TURN, others))
         if self.mapper.goal(robot) is None:  # after much slip, a rest ends the scan
             self._feed(robot, body.rest(_REST_S, others))
-        online = self.mapper.pose(robot)
+        self._arrive(robot)
+
+    def _arrive(self, robot: int) -> None:
+        """Note a stop."""
+        body, online = self.robots[robot], self.mapper.pose(robot)
         known = np.full(3, np.nan) if online is None else online
         self.arrivals.append(Arrival(robot, body.time_s, body.pose.copy(), known, len(self.arrivals)))
 

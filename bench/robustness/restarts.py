@@ -22,13 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.pushbot.exploration import PERIOD_S, START_TURNS, Arrival, Exploration, PushBotNoise
+from bench.pushbot.exploration import PERIOD_S, Arrival, Exploration, PushBotNoise
 from bench.shared.common import ProgressLine
+from swarm_loc_drivers.pushbot.stop_and_go import StopAndGo, StopAndGoSettings
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.poses import decode_odometry, encode_odometry
-from swarm_loc_estimator.common.se2 import between, wrap_angle
+from swarm_loc_estimator.common.se2 import between
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, fix_covariance, inputs_of
@@ -40,10 +41,9 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 BAG = Path("bags/pushbots_two")
 PLANS = ("bag", "corridor", "office", "office.held")
 _LEDS = {"pushbot1": 1000.0, "pushbot2": 1050.0}
-_DURATION_S, _AGAIN_S, _REST_S = 300.0, 10.0, 1.2
+_DURATION_S, _AGAIN_S = 600.0, 10.0
 _ROBOTS = 2
 _HELD = 0.1  # Share of drives in `office.held`
-_BLIND_DRIVE, _CLEARANCE = 0.4, 0.18  # See `stop_and_go`
 
 
 class Restart(NamedTuple):
@@ -131,15 +131,13 @@ class RestartedExploration(Exploration):
     """An exploration in which drivers restart."""
 
     planned: list[Restart] = field(default_factory=list)  # Restarts to come, in order of time by robot
-    # By robot that has restarted, the readings of its newest scan
-    lost: dict[int, Readings] = field(default_factory=dict)
+    # Motion of robots that have restarted, while they have no goal
+    lost: dict[int, StopAndGo] = field(default_factory=dict)
 
     def _feed(self, robot: int, readings: Readings) -> None:
         now = next((one for one in self.planned if one.robot == robot), None)
         if now is None or readings.stamp_ns[-1] * 1e-9 < now.begin_s:
             super()._feed(robot, readings)
-            if robot in self.lost and np.ptp(readings.odometry[:, 2]) > math.pi:
-                self.lost[robot] = readings
             return
         count = int(np.searchsorted(readings.stamp_ns * 1e-9, now.begin_s))
         if count:
@@ -155,22 +153,25 @@ class RestartedExploration(Exploration):
         try:
             if robot in self.lost and self.mapper.goal(robot) is None:
                 self._go_on(robot, self.lost[robot])
-            super()._act(robot)
+            else:
+                super()._act(robot)
         except _Killed as killed:
             self._restart(robot, killed.readings)
 
-    def _go_on(self, robot: int, readings: Readings) -> None:
-        """Drive ahead, or to where it is farthest if something is near, as `StopAndGo` does."""
-        body = self.robots[robot]
+    def _go_on(self, robot: int, motion: StopAndGo) -> None:
+        """Move as the driver's side does without a goal, for a second."""
+        body, rows = self.robots[robot], []
         others = [one for key, one in self.robots.items() if key != robot]
-        if readings.inverse[-1] > 1.0 / (_BLIND_DRIVE + _CLEARANCE):
-            seen = np.where(readings.inverse > 0.0, readings.inverse, np.inf)
-            away = readings.odometry[int(seen.argmin()), 2] - readings.odometry[-1, 2]
-            readings = body.turn(float(wrap_angle(away)), others)
-            self._feed(robot, readings)
-        room = (1.0 / readings.inverse[-1] if readings.inverse[-1] else math.inf) - _CLEARANCE
-        if room > 0.0:
-            self._feed(robot, body.drive(min(_BLIND_DRIVE, room), others))
+        odometry = self._odometry[robot]
+        for _ in range(round(1.0 / PERIOD_S)):
+            forward, _, rate = motion.command(round(1e9 * body.time_s), odometry)
+            rows.append(body.step(forward, rate, others))
+            odometry = rows[-1].odometry[0]
+            motion.take_distance(1.0 / inverse if (inverse := float(rows[-1].inverse[0])) else math.nan)
+        stamp_ns, odometries, inverses, sigmas = zip(*rows, strict=True)
+        together = np.concatenate(stamp_ns), np.concatenate(odometries), np.concatenate(inverses)
+        self._feed(robot, Readings(*together, sigmas[0]))
+        self._arrive(robot)
 
     def _restart(self, robot: int, readings: Readings) -> None:
         """Move on unheard, and scan as at the start."""
@@ -190,18 +191,11 @@ class RestartedExploration(Exploration):
         # the new driver
         body.restart_odometry()
         self._odometry[robot] = np.zeros(3)
-        self.lost[robot] = readings
-        try:
-            for angle, rate in START_TURNS:
-                self._feed(robot, body.turn(angle, others, rate))
-            if self.mapper.goal(robot) is None:
-                self._feed(robot, body.rest(_REST_S, others))
-        except _Killed as killed:
-            self._restart(robot, killed.readings)
-            return
-        online = self.mapper.pose(robot)
-        known = np.full(3, np.nan) if online is None else online
-        self.arrivals.append(Arrival(robot, body.time_s, body.pose.copy(), known, len(self.arrivals)))
+        self.lost[robot] = motion = StopAndGo(StopAndGoSettings())
+        motion.command(
+            round(1e9 * (body.time_s - _AGAIN_S)), np.zeros(3)
+        )  # so that the next is one after a pause
+        self._arrive(robot)
 
 
 def explore(plan: str, seed: int, given: Sequence[Restart]) -> RestartRun:

@@ -27,7 +27,9 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 """[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
-_BLIND_DRIVE = 0.4  # Way of a lost robot that gets no goal, ahead or to where it is farthest [m]
+_BLIND_DRIVE, _STRAIGHT, _OFF = 0.4, 4, 2.4
+"""Drives of a lost robot that gets no goal, ahead or to where it is farthest: length [m], number after which
+it turns off, as it does where something holds it, and by how much [rad]."""
 _HELD_WAY, _MAX_SHRINK, _MIN_READINGS = 0.05, 0.15, 10
 """A body is held if over this way of its wheels [m], which grows with the squared distance as noise does, the
 distance ahead shrinks by less than this share; and minimum number of distances on that way."""
@@ -97,6 +99,7 @@ class StopAndGo:
         # Path by odometry since the drive began [m], and distance ahead [m]
         self._ahead: deque[tuple[float, float]] = deque(maxlen=200)
         self._farthest = self._open_heading = 0.0
+        self._blind_drives, self._was_halted = 0, False  # Since it turned off; the last drive, by an obstacle
 
     def take_distance(self, distance: float) -> None:
         """Take a distance of the laser [m]; NaN: no detection."""
@@ -159,7 +162,11 @@ class StopAndGo:
             if self._is_lost:
                 if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
                     self._moves.append(_Turn(self._open_heading, self._settings.turn_rate, is_heading=True))
+                elif self._was_halted or self._blind_drives >= _STRAIGHT:
+                    self._moves.append(_Turn(_OFF, self._settings.turn_rate))
+                    self._blind_drives = 0
                 self._moves.append(_Drive(_BLIND_DRIVE))
+                self._blind_drives += 1
             self._farthest, self._is_lost = 0.0, True
             self._moves.append(_Turn(SCAN_TURN, self._settings.turn_rate))
         return STILL
@@ -199,7 +206,8 @@ class StopAndGo:
             if left >= _ARRIVED and not self._is_near and not self._is_held():
                 speed = min(max(_GAIN * left, _MIN_SPEED), self._settings.speed)
                 return speed, 0.0, _COURSE_GAIN * float(begin[2] - now[2])
-            self.halts += left >= _ARRIVED
+            self._was_halted = left >= _ARRIVED
+            self.halts += self._was_halted
             return None
         heading = move.angle if move.is_heading else begin[2] + move.angle
         left = heading - now[2]

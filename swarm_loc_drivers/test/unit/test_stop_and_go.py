@@ -214,3 +214,24 @@ def test_after_a_restart_it_turns_to_where_it_is_farthest_if_something_is_ahead(
     x, y = robot.pose[:2] - place
     assert math.hypot(x, y) == pytest.approx(0.4, abs=0.01)
     assert wrap_angle(math.atan2(y, x) - open_heading) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("is_held", "drives"), [(False, 4), (True, 1)])
+def test_a_lost_robot_turns_off_after_some_drives_and_where_something_holds_it(
+    is_held: bool, drives: int
+) -> None:
+    robot = looked_around()
+    robot.odometry[0] += 1.0
+    robot.until_still()
+    courses = []
+    for _ in range(drives + 1):
+        while not robot.step():
+            pass
+        place = robot.pose.copy()
+        while robot.step():
+            if is_held and math.dist(robot.pose[:2], place[:2]) > 0.02:
+                robot.motion.take_distance(1.0)
+        x, y = robot.pose[:2] - place[:2]
+        courses.append(math.atan2(y, x) - place[2])
+    assert wrap_angle(np.array(courses[:-1])) == pytest.approx(0.0, abs=0.02)
+    assert wrap_angle(courses[-1]) == pytest.approx(2.4, abs=0.05)

@@ -102,7 +102,7 @@ def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
     return False
 
 
-def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> bool:
+def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray, *, is_found: bool) -> bool:
     """Align the parts of a robot's first scan with each other and, as one body, with older scans.
 
     Returns whether older scans agree with the start pose.
@@ -112,11 +112,12 @@ def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> bo
         parts: The newest stops, all at one place.
         sigma: (3,) standard deviations of the start pose. If older scans would move the robot by more than
             four of these, the alignment is rejected and the start pose is kept.
+        is_found: Whether the start pose has been found in the map already, and is not searched again.
     """
     away = graph.distances(parts[0])
     others = [one for one in np.argsort(away, kind="stable") if one < parts[0] and away[one] < _START_RADIUS]
     given, states, slip = graph.states[parts[0]].copy(), graph.states.copy(), graph.slip.copy()
-    if others:
+    if others and not is_found:
         against = np.array(others[:_START_AGAINST])
         found = search_offsets(graph.scans, np.array(parts), against, _START_SEARCH)
         if found.score > _MIN_START_SCORE:

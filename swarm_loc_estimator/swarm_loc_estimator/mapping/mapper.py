@@ -528,7 +528,7 @@ class CooperativeMapper:
         track.node = nodes[-1]
         self.graph.starts.update(nodes)
         self.graph.place[nodes] = nodes[0]
-        return align_start(self.graph, nodes, track.prior_sigma)
+        return align_start(self.graph, nodes, track.prior_sigma, is_found=track.search is not None)
 
     def _choose_goal(self, robot: int, track: Track, stop: ScanStop) -> None:
         node = track.node

@@ -116,9 +116,11 @@ class Search:
         best = int(likely.argmax())
         nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
         rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
-        known, fits = self.known[best].sum(), self.fits[best].sum()
-        is_seen = self.known[best, -_PLACES:].mean() > _MIN_KNOWN and fits > _FITS * known
-        return best if is_seen and likely[best] - rival > _RULED_OUT else -1
+        known, fits = self.known[best], self.fits[best]
+        is_seen = known[-_PLACES:].mean() > _MIN_KNOWN
+        # the true place may have been ruled out, and a wrong one that is left fits less and less
+        fits_all = all(fits[n:].sum() > _FITS * known[n:].sum() for n in (0, -_PLACES))
+        return best if is_seen and fits_all and likely[best] - rival > _RULED_OUT else -1
 
     @property
     def is_contradicted(self) -> bool:

@@ -13,6 +13,7 @@ from mapping_world import ROOM, RoomRobot, distance_in_room
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.messages.cdr import LASER, encode
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
+from swarm_loc_estimator.mapping import localization
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.relocation import Search
@@ -241,6 +242,25 @@ def test_a_place_is_not_ruled_out_because_something_held_the_robot_on_its_way(
     poses = np.array([[[0.0, 0.0, 0.0]] * 3, [[0.5, 0.0, 0.0]] * 3])
     fits, known = np.array([[0.98] * 3, [other] * 3]), np.ones((2, 3))
     assert Search(np.zeros(3), 2.0, poses, fits, known, np.zeros(2), np.array(held)).verdict() == found
+
+
+@pytest.mark.parametrize(("newest", "found"), [((0.95, 0.9), 0), ((0.84, 0.79), -1)])
+def test_a_place_that_fits_less_and_less_is_not_found(newest: tuple[float, ...], found: int) -> None:
+    """The true one has been ruled out before."""
+    fits = np.array([[0.96, 0.97, 0.95, 0.92, *newest]])
+    nothing = np.zeros(1)
+    search = Search(np.zeros(3), 2.0, np.zeros((1, 6, 3)), fits, np.ones((1, 6)), nothing, nothing)
+    assert search.verdict() == found
+
+
+def test_a_robot_that_is_found_is_not_searched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In halls whose parts look alike a second search may find another place, 26 cm away."""
+    mapper, robot = mapped(20, 3)
+    monkeypatch.delattr(localization, "search_offsets")
+    restart(robot, 2.1, 0.0)
+    seek(mapper, robot)
+    assert_near(mapper, 0, robot)
+    assert mapper.counters["places_taken_back"] == 0
 
 
 def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
