@@ -65,7 +65,7 @@ def fuse(
     measurements: Measurements,
     begin: int,
     stage: int,
-    together_ns: int,
+    together: bool,
     tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
     limits: sources.LossLimits,
@@ -75,22 +75,22 @@ def fuse(
 ) -> tuple[int, int, int, int]:
     """Fuse measurements (m,), sorted by stamp, from `begin` and a stage on; see the module.
 
-    All robots are predicted to `together_ns` for all measurements, which are between localized robots; with
-    -1 one by one. `work` has one row, or one for each measurement; `lost` and `contradicted` are for the
-    latter. The belief, verdicts (m,) and normalized innovations squared (m,) are written.
+    They are fused one by one, or `together`, where all are between localized robots. `work` has one row, or
+    one for each measurement; `lost` and `contradicted` are for the latter. The belief, verdicts (m,) and
+    normalized innovations squared (m,) are written.
 
     Returns:
         Index of the measurement at which it returns, why, the robot or landmark concerned, and why a robot is
         lost (`LossReason`).
     """
-    together, sample, scratch = together_ns >= 0, track_arrays.new_sample(2), new_scratch()
+    sample, scratch = track_arrays.new_sample(2), new_scratch()
     k = begin
     while k < measurements.stamp_ns.size:
         end = measurements.stamp_ns.size if together else k + 1
         if stage <= PREDICT:
             # 1. Predict both sides to the stamp.
             if together:
-                _predict_together(measurements, together_ns, tracks, belief, limits, work, sample, scratch)
+                _predict_together(measurements, tracks, belief, limits, work, sample, scratch)
                 return k, PREDICTED, -1, 0
             for side in (measurements.observer[k], measurements.target[k]):
                 if side >= 0 and not belief.tracked[side]:
@@ -233,7 +233,6 @@ def _write_surveyed(measurements: Measurements, k: int, belief: BeliefArrays, po
 @cached_njit
 def _predict_together(
     measurements: Measurements,
-    stamp_ns: int,
     tracks: track_arrays.TrackArrays,
     belief: BeliefArrays,
     limits: sources.LossLimits,
@@ -241,15 +240,16 @@ def _predict_together(
     sample: track_arrays.OdometrySample,
     scratch: FloatArray,
 ) -> None:
-    """Predict every involved robot to one instant, and compute poses at the stamps of measurements (m,).
+    """Predict every involved robot to its first stamp, and compute poses at the stamps of measurements (m,).
 
-    Robots that are too uncertain are marked in `work.lost`.
+    At a later instant its covariance would be too small: process noise after a measurement would come before
+    it. Robots that are too uncertain are marked in `work.lost`.
     """
     involved = np.zeros(belief.tracked.size, dtype=np.bool_)
     for k in range(measurements.stamp_ns.size):
         for robot in (measurements.observer[k], measurements.target[k]):
             if robot >= 0 and not involved[robot]:
-                involved[robot] = True
+                involved[robot], stamp_ns = True, measurements.stamp_ns[k]
                 track_arrays.look_up(tracks, robot, stamp_ns, sample, 0)
                 to = Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
                 predict(belief, robot, to, scratch)

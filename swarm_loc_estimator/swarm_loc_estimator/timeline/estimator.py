@@ -105,10 +105,8 @@ class Estimator:
         self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
         if self._drawn is not None and self._origin is not None:
             self._fusion.map = placed_map(self._drawn, self._origin)
-        # a measurement is shifted from its stamp by half a period at most
-        self._lookback_ns = self._tracks.lookback_ns + round(0.5e9 * self.settings.fusion_period_s)
         self._timeline = Timeline(
-            self.settings, self._fusion.step, self._fusion.new_state(), self._lookback_ns
+            self.settings, self._fusion.step, self._fusion.new_state(), self._tracks.lookback_ns
         )
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
@@ -340,7 +338,7 @@ class Estimator:
         """
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
-        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._lookback_ns)
+        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._tracks.lookback_ns)
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)

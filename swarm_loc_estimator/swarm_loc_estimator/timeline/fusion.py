@@ -43,7 +43,6 @@ from swarm_loc_estimator.timeline.map_scans import FoundPlace, MapScans, Sweeps
 from swarm_loc_estimator.timeline.map_search import MapSearch, described_map
 from swarm_loc_estimator.timeline.robots_in_scans import RobotsInScans
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.timeline import middle_of_period
 
 _SURER_AT_FIRST = 1.5  # `lost_heading_sigma` over the greatest sigma of the heading at initialization
 _PAIRS_PER_ROBOT = 32  # Maximum number of observed robots per robot with a mean of infrared measurements
@@ -102,8 +101,9 @@ class Fusion:
         """Fuse measurements (m,) into the state, and execute commands at their stamps; all sorted by stamp.
 
         Few measurements are fused sequentially, each at its exact stamp. Many within `fusion_period_s` are
-        fused as one batch: each uses the poses at its own stamp, but the process noise at the middle of the
-        period. Verdicts (m,) and normalized innovations squared (m,), NaN if not evaluated, are written.
+        fused as one batch: each uses the poses at its own stamp, but the process noise of a robot until its
+        first measurement of the period. Verdicts (m,) and normalized innovations squared (m,), NaN if not
+        evaluated, are written.
         """
         nis[:] = np.nan
         begin = 0
@@ -215,7 +215,7 @@ class Fusion:
             if stage == update.PREDICT:
                 work = new_innovations(1, *self._sides)
             k, why, source, loss = update.fuse(
-                measurements, k, stage, -1, tracks, belief, limits, work, verdicts, nis
+                measurements, k, stage, False, tracks, belief, limits, work, verdicts, nis
             )
             stage = update.PREDICT
             if why == update.FINISHED:
@@ -264,10 +264,9 @@ class Fusion:
         """
         verdicts, nis = np.zeros(rows.size, dtype=np.uint8), np.full(rows.size, np.nan)
         tracks, limits, newest_ns = self._tracks.arrays, self._limits, int(rows.stamp_ns[-1])
-        middle_ns = middle_of_period(int(rows.stamp_ns[0]), self._period_ns)
         # Predict; measurements of robots that are too uncertain now are left out.
         work = new_innovations(rows.size, *self._sides)
-        update.fuse(rows, 0, update.PREDICT, middle_ns, tracks, state.arrays(), limits, work, verdicts, nis)
+        update.fuse(rows, 0, update.PREDICT, True, tracks, state.arrays(), limits, work, verdicts, nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         good = ~(lost[rows.observer] | lost[rows.target])
@@ -286,7 +285,7 @@ class Fusion:
         state.filter.prepare_update(update.related_columns(rows, belief), places, work.cross_covariance)
         stage, why, links = update.EVALUATE, update.IS_LINK, np.flatnonzero(~models.is_compiled(rows.model))
         while why == update.IS_LINK:
-            returned = update.fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, outcome, own_nis)
+            returned = update.fuse(rows, 0, stage, True, tracks, belief, limits, work, outcome, own_nis)
             stage, why = update.ATTRIBUTE, returned[1]
             for k in links.tolist() if why == update.IS_LINK else ():
                 update.evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
@@ -299,7 +298,7 @@ class Fusion:
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
             correlated_noise.note_batch(rows, belief, covariances, work)
-        update.fuse(rows, 0, update.SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
+        update.fuse(rows, 0, update.SETTLE, True, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         for source in np.flatnonzero(work.contradicted).tolist():

@@ -44,18 +44,6 @@ def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
     return -(-stamp_ns // period_ns) * period_ns
 
 
-_end_of_period = cached_njit(end_of_period)
-
-
-@cached_njit
-def middle_of_period(stamp_ns: int, period_ns: int) -> int:
-    """Instant to which robots are predicted for all measurements of the period of a stamp.
-
-    It does not depend on the measurements, so late measurements of the period use the same prediction.
-    """
-    return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2
-
-
 class MeasurementBuffer:
     """Sorted queue of measurements: removed at the front, inserted anywhere.
 
@@ -329,7 +317,7 @@ class Timeline:
     def invalidate(self, changed_from_ns: IntArray) -> None:
         """Mark steps of robots whose tracks have changed after an instant (N,) to be computed again."""
         stamp_ns = self.buffer.stamp_ns
-        first = _first_touched(stamp_ns, *self.buffer.sides, changed_from_ns, self._fusion_period_ns)
+        first = _first_touched(stamp_ns, *self.buffer.sides, changed_from_ns)
         if first < len(self.buffer):
             self._redo_from(int(stamp_ns[first]))
         for command in self._commands:
@@ -461,22 +449,18 @@ def _first_touched(
     observers: IntArray,
     targets: IntArray,
     changed_from_ns: IntArray,
-    period_ns: int,
 ) -> int:
     """First measurement (of m, by stamp) of a robot whose track (of N) changed before it; m if none.
 
-    Changes before the prediction instant of its period count too; an anonymous detection may be of any robot.
+    An anonymous detection may be of any robot.
     """
     if not stamps_ns.size:
         return 0
-    earliest_ns = max(changed_from_ns.min(), stamps_ns[0] - 1) - period_ns
+    earliest_ns = max(changed_from_ns.min(), stamps_ns[0] - 1)
     for k in range(np.searchsorted(stamps_ns, earliest_ns, side="right"), stamps_ns.size):
         if observers[k] < 0 and targets[k] < 0:
             return k
-        lookback_ns = stamps_ns[k]
-        if period_ns:
-            lookback_ns = max(lookback_ns, middle_of_period(stamps_ns[k], period_ns))
         for robot in (observers[k], targets[k]):
-            if robot >= 0 and lookback_ns > changed_from_ns[robot]:
+            if robot >= 0 and stamps_ns[k] > changed_from_ns[robot]:
                 return k
     return stamps_ns.size

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from core_geometry import nees, wrapped
 from core_messages import POSE, POSE_TWO, POSITION, T0
-from core_run import SPARSE, on_time, play, ticks
+from core_run import SPARSE, TOGETHER, on_time, play, ticks
 from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from scipy.stats import chi2
 
@@ -158,6 +158,18 @@ def test_the_closest_stored_state_is_as_good_for_robots_that_stand_and_worse_for
 def test_fusing_together_costs_little_accuracy() -> None:
     together, exact = replace(batched(3), fusion_period_s=0.2), Settings(fusion_period_s=0.0)
     assert rmse(0.1, together) < 1.1 * rmse(0.1, exact)
+
+
+@pytest.mark.parametrize("settings", [TOGETHER, SPARSE], ids=["batch", "sparse"])
+def test_fusing_together_makes_no_robot_surer_than_its_measurements_in_order(settings: Settings) -> None:
+    """Process noise between a measurement and the end of its period counts. Starts are confirmed earlier."""
+    ratios = []
+    for seed in SEEDS:
+        world = world_of(Plan(2, 8.0, landmarks=5), seed)
+        _, together = errors(world, settings, 0.1)
+        _, exact = errors(world, Settings(fusion_period_s=0.0), 0.1)
+        ratios.append(np.diagonal(together, axis1=2, axis2=3) / np.diagonal(exact, axis1=2, axis2=3))
+    assert np.median(ratios, axis=1).min() > 0.95
 
 
 def test_neighbours_help_where_landmarks_are_few() -> None:

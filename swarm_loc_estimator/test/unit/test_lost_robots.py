@@ -425,7 +425,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), CARTESIAN)
     rows, work = select(fixes, np.array(order)), new_innovations(2, 1, 1)
     results = np.zeros(2, dtype=np.uint8), np.zeros(2)
-    fuse(rows, 0, PREDICT, T0, tracks.arrays, state.arrays(), steps._limits, work, *results)
+    fuse(rows, 0, PREDICT, True, tracks.arrays, state.arrays(), steps._limits, work, *results)
     assert (work.lost > 0).tolist() == [True, False]
     steps._deinitialize(state, work, T0)
     assert not state.tracked[0]
