@@ -159,7 +159,7 @@ class RestartedExploration(Exploration):
             self._restart(robot, killed.readings)
 
     def _go_on(self, robot: int, motion: StopAndGo) -> None:
-        """Move as the driver's side does without a goal, for a second."""
+        """Move for a second as `exploration_node` moves a robot without a goal."""
         body, rows = self.robots[robot], []
         others = [one for key, one in self.robots.items() if key != robot]
         odometry = self._odometry[robot]

@@ -99,7 +99,7 @@ class StopAndGo:
         # Path by odometry since the drive began [m], and distance ahead [m]
         self._ahead: deque[tuple[float, float]] = deque(maxlen=200)
         self._farthest = self._open_heading = 0.0
-        self._blind_drives, self._was_halted = 0, False  # Since it turned off; the last drive, by an obstacle
+        self._blind_drives, self._was_halted = 0, False  # Since it turned off; the last drive ended early
 
     def take_distance(self, distance: float) -> None:
         """Take a distance of the laser [m]; NaN: no detection."""
