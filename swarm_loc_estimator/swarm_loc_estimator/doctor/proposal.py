@@ -208,12 +208,9 @@ def robot_topics(topics: Mapping[str, Heard]) -> dict[str, dict[str, str]]:
     for robot, used in found.items():
         truth = [name for name in topics if TRUTH in name and robot in map(_named, name.split("/"))]
         used.update({TRUTH: truth[0]} if truth else {})
-    return dict(sorted(found.items(), key=lambda one: [int(n) if n.isdigit() else n for n in _parts(one[0])]))
-
-
-def _parts(name: str) -> list[str]:
-    """Text and numbers of a name by turns."""
-    return re.split(r"(\d+)", name)
+    # text and numbers of a name by turns
+    parts = {name: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", name)] for name in found}
+    return {name: found[name] for name in sorted(found, key=parts.__getitem__)}
 
 
 def _named(word: str) -> str:

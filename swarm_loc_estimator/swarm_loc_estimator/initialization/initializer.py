@@ -89,7 +89,9 @@ class Initializer:
         now_ns = int(one.stamp_ns)
         track = self._tracks.at(np.array([robot]), np.array([now_ns]))
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
-        if locates_alone(one.columns(), 0) and self._is_sure(robot, one.covariance):
+        x, y, heading = np.sqrt(np.diag(one.covariance)).tolist()
+        is_sure = max(x, y) < POSITION_SIGMA and heading < self._heading_sigma[robot]
+        if is_sure and locates_alone(one.columns(), 0):
             located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED + 1.0)
             return True
         # keep it with the tracks of both sides
@@ -125,11 +127,6 @@ class Initializer:
         else:
             state.next_attempt_ns[robot, int(is_partial)] = now_ns + pause_ns
         return True
-
-    def _is_sure(self, robot: int, covariance: FloatArray) -> bool:
-        """Whether a pose with a covariance (3, 3) may initialize the robot."""
-        x, y, heading = np.sqrt(np.diag(covariance)).tolist()
-        return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma[robot])
 
 
 def _fixed(one: Measurements, on_track: FloatArray) -> InitialPose:

@@ -225,7 +225,9 @@ class Problem:
         damping, fit = 1e-2, self.fit(transform)
         cost = _robust_cost(fit)
         for _ in range(steps):
-            turn = self._about(transform)
+            # right-invariant errors of moves of the centre of the track and of turns about it
+            x, y = se2.transform_points(transform, self.centre[:2])
+            turn = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
             jacobian = fit.jacobian @ turn
             weight = 1.0 / (fit.variance * (1.0 + fit.squared / _ROBUST**2))
             weight[~np.isfinite(fit.residual)] = 0.0
@@ -246,11 +248,6 @@ class Problem:
                 if damping > 1e6:
                     break
         return _Hypothesis(transform, fit)
-
-    def _about(self, transform: FloatArray) -> FloatArray:
-        """Right-invariant errors (3, 3) of moves of the centre of the track and of turns about it."""
-        x, y = se2.transform_points(transform, self.centre[:2])
-        return np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
 
     def apart(self, one: FloatArray, other: FloatArray) -> bool:
         """Whether two transforms (3,) are different hypotheses."""

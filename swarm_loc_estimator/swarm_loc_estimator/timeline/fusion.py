@@ -196,8 +196,8 @@ class Fusion:
             return
         fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep, self._search.around)
         if isinstance(fix, FoundPlace):
-            # where one scan alone has found it, others must agree before it is tracked
-            confirmations = sources.WELL_CONFIRMED if confirms else sources.CONFIRMED
+            # where one scan does not tell its place alone, others must agree before it is tracked
+            confirmations = sources.CONFIRMED + float(confirms)
             self._set_pose(state, robot, stamp_ns, fix.pose, fix.covariance, confirmations)
         elif fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()

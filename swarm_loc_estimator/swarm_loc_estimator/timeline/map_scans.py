@@ -342,7 +342,7 @@ _SYSTEMATIC_SHARE = 0.7
 _ALIKE_M = 2.0  # Distance within which errors of a map are alike [m]
 _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 """Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
-_ALL, SURE_FIT = 3, 0.65
+ALL, SURE_FIT = 3, 0.65
 """Number of directions and share of fitting beams with which a scan confirms a start: elsewhere, walls like
 those at home are seen now and then."""
 _LEFT_OUT, _LEFT_OUT_SHARE = np.array([0.1, 0.1, 0.1]), 0.2
@@ -353,7 +353,6 @@ _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 _GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
-_SAME_PLACE_M = 0.1  # Shift of a pose up to which two scans in a row are enough to believe it
 DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
 SoughtAround = Callable[..., "FoundPlace | None"]  # As `MapSearch.around`
@@ -364,6 +363,7 @@ class FoundPlace(NamedTuple):
 
     pose: FloatArray  # (3,)
     covariance: FloatArray  # (3, 3)
+    is_certain: bool = False  # Whether one scan alone tells it
 
 
 class MapScans:
@@ -381,10 +381,11 @@ class MapScans:
     def fix_of(
         self, state: SwarmState, one: Measurements, sweep: LidarSweep, sought: SoughtAround
     ) -> tuple[Measurements | FoundPlace | None, Verdict, bool]:
-        """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a start.
+        """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a pose.
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
-        `sought`, see `MapSearch.around`, and returned; a near one that two scans in a row tell is confirmed.
+        `sought`, see `MapSearch.around`, and returned. Once a scan contradicts its pose, the robot is not
+        tracked until a scan alone tells the place, or two in a row and odometry agree.
         Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
@@ -409,21 +410,22 @@ class MapScans:
             if delay.backwards > 0.0:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
-        # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
+        # Odometry may have left out a motion, which it reports or not, or the pose was wrong before.
         anchor = np.stack([found.pose, now, self.tracks.at(np.array([robot]), np.array([stamp_ns])).raw[0]])
         reported, follows = self._left_out(delay, anchor, covariance)
         fits = found.outcome in (FITS, FAR) and found.fitting >= SURE_FIT
         away = squared_distance(found.pose, pose, covariance + found.covariance)
         is_known = reported is not None or (follows and fits and away > _GATED)
-        confirmed = state.sources.confirmations[robot] >= CONFIRMED
-        if confirmed and (is_known or not fits):
-            least = SURE_FIT if is_known else max(SURE_FIT, found.fitting + DECLINE)
+        confirmations = state.sources.confirmations[robot]
+        confirmed, is_doubted = confirmations >= CONFIRMED, confirmations == CONFIRMED
+        is_lost = is_known or not fits
+        if confirmed and (is_lost or is_doubted or found.outcome == FAR):
+            least = SURE_FIT if is_known or fits else max(SURE_FIT, found.fitting + DECLINE)
             place = sought(state.map._replace(walls=walls), *beams, pose, covariance, reported, least)
-            if place is not None:
+            if place is not None and (is_lost or place.is_certain):
                 anchor[0] = place.pose
                 state.delays[robot] = delay._replace(anchor=anchor, stamp_ns=-1)
-                is_near = math.dist(place.pose[:2], pose[:2]) < _SAME_PLACE_M
-                return place, Verdict.USED, follows and fits and is_near
+                return place, Verdict.USED, place.is_certain
         # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
             if delay.stamp_ns > 0:
@@ -433,6 +435,7 @@ class MapScans:
             delay = state.delays[robot] = delay._replace(anchor=anchor)
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
+            state.sources.confirmations[robot] = min(confirmations, CONFIRMED)
             if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
                 # later ones may fit by chance, elsewhere
                 state.deinitialize(robot, LossReason.OFF_MAP, stamp_ns)
@@ -448,7 +451,8 @@ class MapScans:
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # With a second solution it locates no robot alone: it was sought near the pose that may be wrong.
         fix.has_second[:], fix.second[:] = True, fix.value
-        return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= SURE_FIT
+        tells = follows if is_doubted else found.determined == ALL
+        return fix, Verdict.OPEN, tells and found.fitting >= SURE_FIT
 
     def _left_out(
         self, delay: DelayBelief, anchor: FloatArray, covariance: FloatArray

@@ -31,6 +31,7 @@ from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.messages import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
+    ALL,
     BLOCKED,
     DECLINE,
     FITS,
@@ -68,6 +69,9 @@ _AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
 _SAME = np.diag(np.square([0.05, 0.05, 0.03]))
+_CLEAR_FIT, _CLEAR_THROUGH, _CLEAR_LEAD = 0.9, 0.02, 0.15
+"""Minimum share of beams that fit, maximum share that go through walls, and minimum lead over places nearby
+of a scan that tells a place alone."""
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
 _SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
@@ -248,13 +252,19 @@ class MapSearch:
         found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
         if not found or found[0].fitting < least:
             return None
-        best = found[0]
+        best, rival = found[0], 0.0
         for other in found[1:]:
             square = squared_distance(best.pose, other.pose, best.covariance + other.covariance + _SAME)
-            if square > _RIVAL and other.fitting > best.fitting - DECLINE:
-                return None
-        information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
-        return FoundPlace(best.pose, np.linalg.inv(information))
+            rival = max(rival, other.fitting) if square > _RIVAL else rival
+        if rival > best.fitting - DECLINE:
+            return None
+        # walls may not tell all: it may be anywhere between the centres
+        way = (centres[-1] - predicted) * [1.0, 1.0, 0.0]
+        around = np.diag(sigma**2) + np.outer(way, way)
+        information = np.linalg.inv(best.covariance) + np.linalg.inv(around)
+        is_clear = best.fitting >= _CLEAR_FIT and best.through <= _CLEAR_THROUGH and best.determined == ALL
+        is_certain = is_clear and best.fitting - rival > _CLEAR_LEAD
+        return FoundPlace(best.pose, np.linalg.inv(information), is_certain)
 
     def _add(
         self,

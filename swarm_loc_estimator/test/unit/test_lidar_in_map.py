@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.se2 import compose, exp
+from swarm_loc_estimator.common.se2 import compose, exp, inverse
 from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.map_file import save_map
@@ -255,6 +255,29 @@ def test_a_robot_that_is_carried_away_is_contradicted_and_then_lost(room: Path) 
         names |= {(one.about, one.kind) for one in estimator.contradictions(at_ns)}
     assert names == {("a", Contradicted.POSE)}
     assert status[-1].status[0] == Status.WAITING
+
+
+@pytest.mark.parametrize("push", [(0.4, 0.0, 0.0), (0.0, -0.3, 0.2), (-0.3, 0.2, 0.0), (0.15, 0.3, -0.3)])
+@pytest.mark.parametrize("blocked", [0, 18])
+def test_one_scan_finds_a_robot_that_was_pushed(
+    room: Path, push: tuple[float, float, float], blocked: int
+) -> None:
+    """Its odometry has not noticed; the first scan afterwards tells, also with a few beams at people."""
+    at_ns, after = 4_000_000_000, LidarRobot()
+    estimator = Estimator(swarm_at(room, after.start))
+    assert hand_in(estimator, sent(at_ns, seed=1))[-1].status[0] == Status.TRACKED
+    after.start = compose(compose(after.pose(at_ns), push), inverse(after.odometry(np.array([at_ns]))[0]))
+    for begin_ns in range(at_ns, at_ns + 5 * SWEEP_NS, SWEEP_NS):
+        end_ns, scan = begin_ns + SWEEP_NS, after.scan(begin_ns)
+        scan.ranges[:blocked] = np.minimum(scan.ranges[:blocked], 0.5)
+        odometry = odometry_bytes("a", end_ns, after.odometry(np.array([end_ns])))
+        estimate = hand_in(estimator, [("a/odom", end_ns, odometry), ("a/scan", end_ns, scan_bytes(scan))])[
+            -1
+        ]
+        error = wrapped(estimate.poses[0] - after.pose(end_ns))
+        assert estimate.status[0] == Status.TRACKED
+        assert np.hypot(error[0], error[1]) < CELL
+        assert nees(error[None], estimate.covariances)[0] < 16.0
 
 
 def test_scans_are_only_taken_with_a_map(room: Path) -> None:

@@ -190,7 +190,11 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # a robot that corrects its course by feedback seems to follow its wheels late: no recording is sure
         mean, sigma = np.where(is_delay, mean, typical), np.where(is_delay, sigma, apart)
         # motion and noise by its paths
-        known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
+        gap_ns = {
+            name: np.median(np.diff(one.stamp_ns)) for name, one in truth.items() if one.stamp_ns.size > 1
+        }
+        dense = {name: truth[name] for name, one in gap_ns.items() if one <= DENSE_GAP_NS}
+        known = solution.paths() | dense
         paths = {name: one for name, one in known.items() if not truth or name in truth}
         known_by = problem_of(recording, found, fixed=True)
         models = _fitted(recording, begin, known_by, paths, options, solution)
@@ -224,10 +228,6 @@ def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[Float
             typical, apart = population(mean[rows], solution.parameter_sigma[rows], sigma[0])
             mean[rows], sigma[rows] = typical, apart
     return mean, sigma
-
-
-def _is_dense(path: Trajectory) -> bool:
-    return path.stamp_ns.size > 1 and float(np.median(np.diff(path.stamp_ns))) <= DENSE_GAP_NS
 
 
 def _fitted(

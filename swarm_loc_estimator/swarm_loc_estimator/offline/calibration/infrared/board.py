@@ -233,12 +233,10 @@ class _Problem:
             rows = np.flatnonzero(data.receiver == robot)
             for i in range(n):
                 columns[first + self._robots + place * n + i, rows, i] = by_log[rows, i]
-        return np.concatenate([columns.reshape(unknowns.size, -1).T, self._held_slopes(unknowns)])
-
-    def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Jacobian of the regularization by finite differences, which are cheap here."""
+        # the regularization by finite differences, which are cheap here
         here, ahead = self._held(unknowns), unknowns + _STEP * np.eye(unknowns.size)
-        return np.stack([(self._held(one) - here) / _STEP for one in ahead], axis=1)
+        slopes = np.stack([(self._held(one) - here) / _STEP for one in ahead], axis=1)
+        return np.concatenate([columns.reshape(unknowns.size, -1).T, slopes])
 
     def _held(self, unknowns: FloatArray) -> FloatArray:
         law, sensor, emitter, yaw = self.parts(unknowns)

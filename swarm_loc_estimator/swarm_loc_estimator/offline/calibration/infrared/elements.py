@@ -394,7 +394,11 @@ def _unexplained(repeats: _Repeats, sigma: FloatArray, order: IntArray) -> tuple
     """
     weight = np.where(repeats.known, 1.0 / sigma, 0.0)
     flat = (len(sigma), -1)
-    motions = [(way * weight).reshape(flat) for way in _motions(repeats.level, order)]
+    # directions of change with range, bearing and heading, unnormalized
+    level, back = repeats.level, np.argsort(order)
+    following, before = order[(back + 1) % len(order)], order[back - 1]
+    ways = level, level[:, following] - level[:, before], level[:, :, following] - level[:, :, before]
+    motions = [(way * weight).reshape(flat) for way in ways]
     basis = np.linalg.qr(np.stack(motions, axis=-1))[0]
     change = (repeats.change * weight).reshape(flat)
     along = np.einsum("pcw,pc->pw", basis, change)
@@ -404,13 +408,6 @@ def _unexplained(repeats: _Repeats, sigma: FloatArray, order: IntArray) -> tuple
     determined = repeats.known.reshape(flat) & (free > _MIN_FREE) & stands[:, None]
     noise = rest / np.sqrt(2.0 * np.maximum(free, _MIN_FREE)) * sigma.reshape(flat)
     return noise.reshape(sigma.shape), determined.reshape(sigma.shape)
-
-
-def _motions(level: FloatArray, order: IntArray) -> list[FloatArray]:
-    """Directions of change of readings (p, n, n) with range, bearing and heading, unnormalized."""
-    back = np.argsort(order)
-    following, before = order[(back + 1) % len(order)], order[back - 1]
-    return [level, level[:, following] - level[:, before], level[:, :, following] - level[:, :, before]]
 
 
 def _stands(repeats: _Repeats, sigma: FloatArray, moving: FloatArray, rest: FloatArray) -> BoolArray:
