@@ -45,10 +45,7 @@ def test_real_commands_leave_nothing_cut(name: str, here: Place) -> None:
     assert not trials.faults
 
 
-@pytest.mark.parametrize(
-    ("text", "faults"),
-    [(CARELESS, {*KINDS} - {"tried"}), (CAREFUL, set())],
-)
+@pytest.mark.parametrize(("text", "faults"), [(CARELESS, {*KINDS} - {"tried"}), (CAREFUL, set())])
 def test_what_a_careless_command_does_is_counted(
     text: str, faults: set[str], here: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,12 +40,7 @@ from swarm_loc_drivers.droplet.protocol import (
     StepLength,
 )
 from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand
-from swarm_loc_drivers.sim.droplet.world import (
-    NEAR_POWER,
-    STEP_NS,
-    DropletErrors,
-    DropletWorld,
-)
+from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
 from swarm_loc_estimator.cli import calibrate_ir
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.replay import replay

@@ -210,73 +210,64 @@ CYCLE_NS = 2 * DELAY_NS
 
 
 class Client:
-    """Reads what a WiFi firmware streams, every millisecond."""
+    """A robot with a WiFi firmware, and what this streams, read every millisecond."""
 
-    def __init__(self, firmware: WifiFirmware, clock: Clock) -> None:
-        self._firmware, self._clock = firmware, clock
+    def __init__(self, *, counts_right_backwards: bool = False) -> None:
+        self.clock = Clock()
+        self.body = DrivenBody(self.clock)
+        self.firmware = WifiFirmware(self.body, counts_right_backwards=counts_right_backwards)
         self._parser = epuck_wifi.StreamParser()
+
+    def command(self, left: int, right: int, *, camera: bool = False, sensors: bool = True) -> None:
+        """Send a command."""
+        self.firmware.receive(command(left, right, camera=camera, sensors=sensors))
 
     def read(self, duration_ns: int) -> list[epuck_wifi.Message]:
         """The messages of some time."""
         messages = []
         for _ in range(duration_ns // MS):
-            self._clock.now_ns += MS
-            if data := self._firmware.stream():
-                messages += self._parser.feed(data, self._clock.now_ns)
+            self.clock.now_ns += MS
+            if data := self.firmware.stream():
+                messages += self._parser.feed(data, self.clock.now_ns)
         return messages
 
 
 @pytest.fixture
-def firmware(body: DrivenBody) -> WifiFirmware:
-    return WifiFirmware(body)
-
-
-@pytest.fixture
-def client(firmware: WifiFirmware, clock: Clock) -> Client:
-    return Client(firmware, clock)
+def client() -> Client:
+    return Client()
 
 
 @pytest.mark.parametrize("first", [b"", bytes(21), bytes(20) + command(1, 1)])
-def test_nothing_is_streamed_before_a_command_that_is_read_whole(
-    firmware: WifiFirmware, client: Client, first: bytes
-) -> None:
-    firmware.receive(first[:20])
+def test_nothing_is_streamed_before_a_command_that_is_read_whole(client: Client, first: bytes) -> None:
+    client.firmware.receive(first[:20])
     assert client.read(CYCLE_NS) == []
-    firmware.receive(first[20:])
+    client.firmware.receive(first[20:])
     assert client.read(CYCLE_NS) == []
 
 
-def test_a_command_is_obeyed_when_the_values_before_it_have_been_fetched(
-    firmware: WifiFirmware, client: Client, body: DrivenBody
-) -> None:
-    firmware.receive(command(100, 200))
+def test_a_command_is_obeyed_when_the_values_before_it_have_been_fetched(client: Client) -> None:
+    client.command(100, 200)
     (message,) = client.read(CYCLE_NS)
     assert message.id == epuck_wifi.SENSORS_ID
-    assert body.rates == (100.0, 200.0)
+    assert client.body.rates == (100.0, 200.0)
 
 
-def test_later_commands_are_not_checked_and_misalignment_persists(
-    firmware: WifiFirmware, client: Client, body: DrivenBody
-) -> None:
-    firmware.receive(command(0, 0))
+def test_later_commands_are_not_checked_and_misalignment_persists(client: Client) -> None:
+    client.command(0, 0)
     client.read(CYCLE_NS)
-    firmware.receive(b"\x07" + command(100, 100) + command(100, 100))
+    client.firmware.receive(b"\x07" + command(100, 100) + command(100, 100))
     client.read(3 * CYCLE_NS)
-    assert body.rates != (100.0, 100.0)
+    assert client.body.rates != (100.0, 100.0)
 
 
-def test_of_too_many_commands_the_last_counts(
-    firmware: WifiFirmware, client: Client, body: DrivenBody
-) -> None:
-    firmware.receive(b"".join(command(speed, speed) for speed in (0, 50, 60, 70, 80, 100)))
+def test_of_too_many_commands_the_last_counts(client: Client) -> None:
+    client.firmware.receive(b"".join(command(speed, speed) for speed in (0, 50, 60, 70, 80, 100)))
     client.read(CYCLE_NS)
-    assert body.rates == (100.0, 100.0)
+    assert client.body.rates == (100.0, 100.0)
 
 
-def test_without_camera_fifty_readings_a_second_come_each_a_cycle_old(
-    firmware: WifiFirmware, client: Client
-) -> None:
-    firmware.receive(command(500, -500))
+def test_without_camera_fifty_readings_a_second_come_each_a_cycle_old(client: Client) -> None:
+    client.command(500, -500)
     messages = client.read(2 * SECOND)
     assert {message.id for message in messages} == {epuck_wifi.SENSORS_ID}
     assert 98 <= len(messages) <= 100
@@ -289,13 +280,11 @@ def test_without_camera_fifty_readings_a_second_come_each_a_cycle_old(
     assert (messages[-1].sensors["proximity"] == PROXIMITY).all()
 
 
-def test_with_camera_every_image_is_followed_by_one_reading_a_cycle_old(
-    firmware: WifiFirmware, client: Client, body: DrivenBody, clock: Clock
-) -> None:
-    firmware.receive(command(500, -500, camera=True))
+def test_with_camera_every_image_is_followed_by_one_reading_a_cycle_old(client: Client) -> None:
+    client.command(500, -500, camera=True)
     messages = []
     for step in range(60):
-        body.frame = (np.full((96, 128), step, np.uint8), clock.now_ns)
+        client.body.frame = (np.full((96, 128), step, np.uint8), client.clock.now_ns)
         messages += client.read(33 * MS)
     kinds = [message.id for message in messages]
     assert kinds[:20] == [epuck_wifi.IMAGE_ID, epuck_wifi.SENSORS_ID] * 10
@@ -305,57 +294,49 @@ def test_with_camera_every_image_is_followed_by_one_reading_a_cycle_old(
     assert counters[-1] == pytest.approx(500 * (readings[-2].stamp_ns - readings[0].stamp_ns) / SECOND, abs=1)
 
 
-def test_an_image_is_sent_once_and_the_next_one_waited_for(
-    firmware: WifiFirmware, client: Client, body: DrivenBody
-) -> None:
-    firmware.receive(command(0, 0, camera=True))
-    body.frame = (np.zeros((96, 128), np.uint8), 1)
+def test_an_image_is_sent_once_and_the_next_one_waited_for(client: Client) -> None:
+    client.command(0, 0, camera=True)
+    client.body.frame = (np.zeros((96, 128), np.uint8), 1)
     assert len(client.read(SECOND)) == 2
-    body.frame = (np.zeros((96, 128), np.uint8), 2)
+    client.body.frame = (np.zeros((96, 128), np.uint8), 2)
     assert len(client.read(2 * IMAGE_NS)) == 2
 
 
 @pytest.mark.parametrize("blocked_ns", [200 * MS, SECOND])
-def test_what_waited_while_sending_was_blocked_is_as_old_as_that(
-    firmware: WifiFirmware, client: Client, clock: Clock, blocked_ns: int
-) -> None:
-    firmware.receive(command(500, 500))
+def test_what_waited_while_sending_was_blocked_is_as_old_as_that(client: Client, blocked_ns: int) -> None:
+    client.command(500, 500)
     before = client.read(SECOND)[-1]
-    clock.now_ns += blocked_ns
+    client.clock.now_ns += blocked_ns
     stale, fresh, *_ = client.read(2 * CYCLE_NS)
     gone = [int(message.sensors["left_counter"]) for message in (before, stale, fresh)]
     assert gone[1] - gone[0] == pytest.approx(10, abs=1)
     assert gone[2] - gone[1] == pytest.approx(500 * (blocked_ns + CYCLE_NS) / SECOND, abs=10)
 
 
-def test_an_exchange_between_the_chips_that_fails_costs_a_second(
-    firmware: WifiFirmware, client: Client
-) -> None:
-    firmware.receive(command(500, 500))
+def test_an_exchange_between_the_chips_that_fails_costs_a_second(client: Client) -> None:
+    client.command(500, 500)
     client.read(SECOND)
-    firmware.exchange_fails = True
+    client.firmware.exchange_fails = True
     gaps_ns = np.diff([message.stamp_ns for message in client.read(2 * SECOND)])
     assert FAILED_EXCHANGE_NS <= gaps_ns.max() <= FAILED_EXCHANGE_NS + CYCLE_NS
 
 
-def test_old_firmware_counts_the_right_wheel_backwards(clock: Clock, body: DrivenBody) -> None:
-    firmware = WifiFirmware(body, counts_right_backwards=True)
-    firmware.receive(command(500, 500))
-    sensors = Client(firmware, clock).read(SECOND)[-1].sensors
+def test_old_firmware_counts_the_right_wheel_backwards() -> None:
+    client = Client(counts_right_backwards=True)
+    client.command(500, 500)
+    sensors = client.read(SECOND)[-1].sensors
     assert sensors["left_counter"] > 400
     assert sensors["right_counter"] == -sensors["left_counter"]
 
 
-def test_both_streams_off_is_said(firmware: WifiFirmware, client: Client) -> None:
-    firmware.receive(command(-5, 7, sensors=False))
+def test_both_streams_off_is_said(client: Client) -> None:
+    client.command(-5, 7, sensors=False)
     assert {message.id for message in client.read(2 * CYCLE_NS)} == {epuck_wifi.NOTHING_ID}
 
 
-def test_wheels_run_on_when_the_client_leaves(
-    firmware: WifiFirmware, client: Client, body: DrivenBody
-) -> None:
-    firmware.receive(command(100, 100))
+def test_wheels_run_on_when_the_client_leaves(client: Client) -> None:
+    client.command(100, 100)
     client.read(CYCLE_NS)
-    firmware.disconnect()
+    client.firmware.disconnect()
     assert client.read(CYCLE_NS) == []
-    assert body.rates == (100.0, 100.0)
+    assert client.body.rates == (100.0, 100.0)

@@ -70,20 +70,14 @@ def test_a_velocity_counts_until_its_time_is_over() -> None:
     assert counts == {"stale_cmd_vel": 1}
 
 
-def test_a_clock_that_stands_still_stops_the_robot() -> None:
+@pytest.mark.parametrize(("clock_ns", "steady_s"), [(0, STANDING_CLOCK_S + 0.01), (-1, 0.0)])
+def test_a_clock_that_stands_still_or_jumps_back_stops_the_robot(clock_ns: int, steady_s: float) -> None:
     watch = Watch()
     command, _ = command_with(watch)
     command.set(AHEAD)
     assert command.velocity() == AHEAD
-    watch.steady_s += STANDING_CLOCK_S + 0.01
-    assert command.velocity() == STILL
-
-
-def test_a_clock_that_jumps_back_stops_the_robot() -> None:
-    watch = Watch()
-    command, _ = command_with(watch)
-    command.set(AHEAD)
-    watch.now_ns -= 1
+    watch.now_ns += clock_ns
+    watch.steady_s += steady_s
     assert command.velocity() == STILL
 
 
@@ -116,13 +110,15 @@ def test_what_is_not_finite_or_absurd_is_dropped(velocity: Velocity) -> None:
 
 
 class Wheels:
-    """Counters that do what was commanded."""
+    """Counters that do what was commanded, read once at some steps, and the odometry of them."""
 
-    def __init__(self, odometry: WheelOdometry, steps: tuple[int, int] = (0, 0)) -> None:
-        self.odometry = odometry
+    def __init__(self, rate: tuple[float, float] = (0.0, 0.0), steps: tuple[int, int] = (0, 0)) -> None:
+        self.counts: Counter[str] = Counter()
+        self.odometry = WheelOdometry(GEOMETRY, NOISE, self.counts)
         self.steps = np.array(steps, dtype=float)
         self.now_ns = SECOND
-        self.rates = np.zeros(2)
+        self.first = self.state()
+        self.command(*rate)
 
     def command(self, left: float, right: float) -> None:
         """Change the rates."""
@@ -146,22 +142,8 @@ class Wheels:
         return state
 
 
-@pytest.fixture
-def counts() -> Counter[str]:
-    return Counter()
-
-
-@pytest.fixture
-def odometry(counts: Counter[str]) -> WheelOdometry:
-    return WheelOdometry(GEOMETRY, NOISE, counts)
-
-
-def test_an_arc_is_an_arc_through_many_wraps_of_the_counters(
-    odometry: WheelOdometry, counts: Counter[str]
-) -> None:
-    wheels = Wheels(odometry, steps=(32000, -32700))
-    wheels.read()
-    wheels.command(1000.0, 800.0)
+def test_an_arc_is_an_arc_through_many_wraps_of_the_counters() -> None:
+    wheels = Wheels((1000.0, 800.0), (32000, -32700))
     for _ in range(4000):
         wheels.run(0.05)
         state = wheels.state()
@@ -170,65 +152,53 @@ def test_an_arc_is_an_arc_through_many_wraps_of_the_counters(
     expected = se2.exp([paths.mean(), 0.0, turn])
     assert state.pose[:2] == pytest.approx(expected[:2], abs=2e-3)
     assert float(se2.wrap_angle(state.pose[2] - turn)) == pytest.approx(0.0, abs=1e-6)
-    assert not counts
+    assert not wheels.counts
 
 
-def test_through_a_long_gap_the_robot_is_believed_to_have_obeyed(
-    odometry: WheelOdometry, counts: Counter[str]
-) -> None:
-    wheels = Wheels(odometry)
-    wheels.read()
-    wheels.command(-800.0, -800.0)
+def test_through_a_long_gap_the_robot_is_believed_to_have_obeyed() -> None:
+    wheels = Wheels((-800.0, -800.0))
     wheels.run(0.1)
     wheels.read()
     wheels.run(300.0)
     wheels.odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # said on reconnecting, just before the reading
     state = wheels.state()
     assert state.pose[0] == pytest.approx(-800.0 * 300.1 * GEOMETRY.metres_per_step, abs=1e-3)
-    assert not counts
+    assert not wheels.counts
 
 
-def test_one_corrupt_reading_is_left_out(odometry: WheelOdometry, counts: Counter[str]) -> None:
-    wheels = Wheels(odometry)
-    wheels.read()
-    wheels.command(400.0, 400.0)
+def test_one_corrupt_reading_is_left_out() -> None:
+    wheels = Wheels((400.0, 400.0))
     wheels.run(0.1)
-    assert odometry.update(wheels.now_ns, 0x2828, 40) is None
+    assert wheels.odometry.update(wheels.now_ns, 0x2828, 40) is None
     wheels.run(0.1)
     state = wheels.state()
     assert state.pose == pytest.approx([80 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
-    assert counts == {"implausible_counters": 1}
+    assert wheels.counts == {"implausible_counters": 1}
 
 
-def test_a_robot_that_may_have_misunderstood_is_believed_by_its_counters(
-    odometry: WheelOdometry, counts: Counter[str]
-) -> None:
-    wheels = Wheels(odometry)
-    wheels.read()
-    wheels.command(20.0, 20.0)
+def test_a_robot_that_may_have_misunderstood_is_believed_by_its_counters() -> None:
+    wheels = Wheels((20.0, 20.0))
     wheels.rates = np.array([-700.0, 20.0])  # by a command that was twisted on the way
     wheels.run(1.0)
-    odometry.doubt_rates(wheels.now_ns - SECOND, EPUCK1.max_rate)
+    wheels.odometry.doubt_rates(wheels.now_ns - SECOND, EPUCK1.max_rate)
     state = wheels.state()
     turn = 720 * GEOMETRY.metres_per_step / GEOMETRY.wheel_separation
     assert float(se2.wrap_angle(state.pose[2] - turn)) == pytest.approx(0.0, abs=1e-9)
-    assert not counts
+    assert not wheels.counts
 
 
-def test_a_command_that_takes_its_time_is_no_fault(odometry: WheelOdometry, counts: Counter[str]) -> None:
-    wheels = Wheels(odometry)
-    wheels.read()
-    wheels.command(600.0, 600.0)
+def test_a_command_that_takes_its_time_is_no_fault() -> None:
+    wheels = Wheels((600.0, 600.0))
     wheels.run(1.0)
     wheels.read()
-    odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # under way for 0.2 s, while readings come
+    wheels.odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # under way for 0.2 s, while readings come
     for _ in range(4):
         wheels.run(0.05)
         assert wheels.read() is not None
     wheels.rates = np.zeros(2)
     wheels.run(0.05)
     assert wheels.read() is not None
-    assert not counts
+    assert not wheels.counts
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 1.0)), min_size=1, max_size=20))
@@ -248,12 +218,8 @@ def test_a_robot_may_read_its_counters_at_any_time_between_question_and_answer(
     assert not counts
 
 
-def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
-    odometry: WheelOdometry, counts: Counter[str]
-) -> None:
-    wheels = Wheels(odometry, steps=(20000, 20000))
-    wheels.read()
-    wheels.command(400.0, 400.0)
+def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure() -> None:
+    wheels = Wheels((400.0, 400.0), (20000, 20000))
     wheels.run(1.0)
     sure = wheels.state()
     wheels.run(0.5)
@@ -266,36 +232,26 @@ def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
     assert lost.pose == pytest.approx(sure.pose)
     assert math.sqrt(lost.covariance[0, 0]) > 0.5 * 400 * GEOMETRY.metres_per_step
     assert after.pose[0] - lost.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
-    assert counts == {"implausible_counters": 1, "counter_restarts": 1}
+    assert wheels.counts == {"implausible_counters": 1, "counter_restarts": 1}
 
 
-def test_time_that_stands_tells_nothing(odometry: WheelOdometry) -> None:
-    wheels = Wheels(odometry)
-    assert wheels.read() is not None
-    assert wheels.read() is None
+def test_time_that_stands_tells_nothing() -> None:
+    assert Wheels().read() is None
 
 
 @pytest.mark.parametrize("back_s", [0.051, 5.0])
-def test_a_step_of_the_clock_costs_no_way(
-    odometry: WheelOdometry, counts: Counter[str], back_s: float
-) -> None:
-    wheels = Wheels(odometry, steps=(32700, 32700))
-    wheels.read()
-    wheels.command(1000.0, 1000.0)
+def test_a_step_of_the_clock_costs_no_way(back_s: float) -> None:
+    wheels = Wheels((1000.0, 1000.0), (32700, 32700))
     for jump_s in (0.0, back_s, 0.0):
         wheels.run(0.05)
         wheels.now_ns -= round(jump_s * SECOND)
         state = wheels.state()
     assert state.pose == pytest.approx([150 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
-    assert counts == {"time_jumps": 1}
+    assert wheels.counts == {"time_jumps": 1}
 
 
-def test_counters_that_begin_anew_with_time_tell_no_way(
-    odometry: WheelOdometry, counts: Counter[str]
-) -> None:
-    wheels = Wheels(odometry, steps=(20000, 20000))
-    wheels.read()
-    wheels.command(400.0, 400.0)
+def test_counters_that_begin_anew_with_time_tell_no_way() -> None:
+    wheels = Wheels((400.0, 400.0), (20000, 20000))
     wheels.run(1.0)
     before = wheels.state()
     wheels.now_ns, wheels.steps = SECOND // 2, np.zeros(2)
@@ -305,14 +261,13 @@ def test_counters_that_begin_anew_with_time_tell_no_way(
     assert jumped.pose == pytest.approx(before.pose)
     assert jumped.covariance[0, 0] > before.covariance[0, 0]
     assert after.pose[0] - jumped.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
-    assert counts == {"time_jumps": 1, "counter_restarts": 1}
+    assert wheels.counts == {"time_jumps": 1, "counter_restarts": 1}
 
 
 @given(legs=st.lists(st.tuples(RATE, RATE, st.integers(1, 20)), min_size=1, max_size=12))
 def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, float, int]]) -> None:
-    odometry = WheelOdometry(GEOMETRY, NOISE, Counter())
-    wheels = Wheels(odometry)
-    states = [wheels.state()]
+    wheels = Wheels()
+    states = [wheels.first]
     for left, right, readings in legs:
         wheels.command(left, right)
         for _ in range(readings):

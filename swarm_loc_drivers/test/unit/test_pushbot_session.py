@@ -22,13 +22,23 @@ def streaming(
     return wire
 
 
+def driving(
+    velocities: tuple[int, int],
+    params_of: dict[str, object] | None = None,
+    generation: FirmwareGeneration = SECOND_FIRMWARE,
+) -> PushbotWire:
+    """A robot that is connected and has driven for half a second."""
+    wire = streaming(params_of, generation)
+    wire.velocities = velocities
+    wire.run(0.5)
+    return wire
+
+
 @pytest.mark.parametrize(
     ("generation", "timestamps"), FORMATS, ids=lambda one: getattr(one, "name", one or "off")
 )
 def test_every_format_of_every_firmware_streams(generation: FirmwareGeneration, timestamps: str) -> None:
-    wire = streaming({"timestamps": timestamps} if timestamps else {"events": False}, generation)
-    wire.velocities = (20, 30)
-    wire.run(0.5)
+    wire = driving((20, 30), {"timestamps": timestamps} if timestamps else {"events": False}, generation)
     wire.velocities = (0, 0)
     wire.run(0.3)
     assert not wire.errors
@@ -85,9 +95,7 @@ def test_a_robot_that_does_not_answer_is_named() -> None:
 
 @pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
 def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
-    wire = streaming(generation=generation)
-    wire.velocities = (60, 60)
-    wire.run(0.5)
+    wire = driving((60, 60), generation=generation)
     assert wire.speed > 0.3
     wire.session.ending = True
     wire.run(0.1)
@@ -106,9 +114,7 @@ def test_a_stop_that_the_firmware_loses_is_repeated_until_the_wheels_stand(
     generation: FirmwareGeneration, ends: bool
 ) -> None:
     """Parsed just after a tick of the clock, the stop is overwritten by the controllers' pending update."""
-    wire = streaming(generation=generation)
-    wire.velocities = (60, 60)
-    wire.run(0.5)
+    wire = driving((60, 60), generation=generation)
     wire.firmware.late_share = 1.0
     before = wire.sent.count(commands.BRAKE)
     wire.velocities, wire.session.ending = (0, 0), ends
@@ -127,10 +133,8 @@ def test_a_stop_that_the_firmware_loses_is_repeated_until_the_wheels_stand(
 
 
 def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
-    wire = streaming(generation=FIRST_FIRMWARE)
+    wire = driving((30, 30), generation=FIRST_FIRMWARE)
     driver = PushbotDriver(pushbot_params(), PushbotListeners(print, print), lambda: 0)
-    wire.velocities = (30, 30)
-    wire.run(0.5)
     wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[assignment, method-assign]
     wire.velocities = (0, 0)
     wire.run(0.9)
@@ -177,9 +181,7 @@ def test_wheels_that_are_turned_by_hand_are_reported_until_they_stand() -> None:
 
 
 def test_a_robot_that_hears_and_is_not_heard_is_stopped() -> None:
-    wire = streaming()
-    wire.velocities = (60, 60)
-    wire.run(0.5)
+    wire = driving((60, 60))
     wire.hears = False
     wire.run(0.5)
     assert wire.errors == ["the robot has stopped sending wheel ticks"]
@@ -188,9 +190,7 @@ def test_a_robot_that_hears_and_is_not_heard_is_stopped() -> None:
 
 def test_a_robot_that_hears_nothing_stops_by_itself() -> None:
     """The velocity holds a second and then decays by a unit each tenth of a second."""
-    wire = streaming()
-    wire.velocities = (20, 20)
-    wire.run(0.5)
+    wire = driving((20, 20))
     wire.is_heard = False
     wire.run(1.2 + 2.0 + 0.3)
     assert wire.speed < 0.02
@@ -205,9 +205,7 @@ def test_a_velocity_is_told_again_before_it_decays() -> None:
 
 
 def test_a_robot_that_was_reset_is_set_up_anew() -> None:
-    wire = streaming()
-    wire.velocities = (40, 40)
-    wire.run(0.5)
+    wire = driving((40, 40))
     before = wire.states[-1].pose
     wire.firmware.receive(commands.RESET)
     wire.step()
@@ -222,9 +220,7 @@ def test_a_robot_that_was_reset_is_set_up_anew() -> None:
 
 def test_a_stall_of_the_link_loses_events_and_nothing_else() -> None:
     """Nobody takes its bytes for a while: its ring overflows, its ticks and its clock go on."""
-    wire = streaming({"reply_timeout_s": 1.0, "led_frequency": 0.0})
-    wire.velocities = (20, 20)
-    wire.run(0.5)
+    wire = driving((20, 20), {"reply_timeout_s": 1.0, "led_frequency": 0.0})
     for _ in range(100):
         wire.world.step()
     wire.run(0.5)
@@ -240,9 +236,7 @@ def test_a_stall_of_the_link_loses_events_and_nothing_else() -> None:
 
 def test_a_long_stall_blocks_the_robot_and_the_driver_resets_it() -> None:
     """When its text has no room the main loop waits: motors keep their duty, and no command is obeyed."""
-    wire = streaming()
-    wire.velocities = (40, 40)
-    wire.run(0.5)
+    wire = driving((40, 40))
     for _ in range(1000):
         wire.world.step()
         if not wire.firmware.board.is_blocked:
@@ -259,9 +253,7 @@ def test_a_long_stall_blocks_the_robot_and_the_driver_resets_it() -> None:
 @pytest.mark.parametrize("pause_s", [3.0, 30.0])
 def test_a_driver_that_is_stopped_for_a_while_misses_no_motion(pause_s: float, timestamps: str) -> None:
     """Its robot turns on; the oldest bytes wait in the buffers meanwhile, and are no news afterwards."""
-    wire = streaming({"timestamps": timestamps}, FIRST_FIRMWARE)
-    wire.velocities = (-9, 9)
-    wire.run(0.5)
+    wire = driving((-9, 9), {"timestamps": timestamps}, FIRST_FIRMWARE)
     before, waiting = len(wire.states), b""
     end_ns = wire.world.now_ns + round(1e9 * pause_s)
     while wire.world.now_ns < end_ns:

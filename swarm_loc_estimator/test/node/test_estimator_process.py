@@ -33,12 +33,6 @@ from swarm_loc_estimator.common.node import _EACH_CHANGE, drop_negative_clocks
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 
-LONG_ROBOT = """  robot{}:
-    odometry: {{wheel_separation: 0.053, wheel_noise: 0.00002}}
-    sensor: {{forward_sigma: 0.02, left_sigma: 0.02, heading_sigma: 0.035}}
-    faces: {{front: {{x: 0.035, yaw: 0.0, size: 0.036}}}}
-    start: {{x: 1.0, y: 1.0, theta: 0.0}}"""
-
 
 def _program(tmp_path: Path, **parameters: object) -> Program:
     return Program("estimator_node", tmp_path / "log", parameters)
@@ -60,25 +54,6 @@ def test_a_bad_parameter_ends_the_node_with_one_sentence(
         (line,) = [line for line in program.output.splitlines() if "[rcl]" not in line]
     assert line.startswith("estimator_node: ")
     assert sentence in line
-
-
-@pytest.mark.parametrize(
-    ("robot", "sentence"),
-    [
-        ("  robot{}: {{}}", "robots names 10000 robots but must name at most 5000."),
-        (LONG_ROBOT, "has more than the 2000000 bytes that are allowed."),
-    ],
-    ids=["short", "long"],
-)
-def test_ten_thousand_robots_are_refused_in_one_sentence(tmp_path: Path, robot: str, sentence: str) -> None:
-    path = tmp_path / "swarm.yaml"
-    robots = "\n".join(robot.format(number) for number in range(10_000))
-    path.write_text(f"fileversion: 1\nrobots:\n{robots}\n", encoding="utf-8")
-    with _program(tmp_path, swarm_file=path) as program:
-        assert program.end() == 1
-        (line,) = program.output.splitlines()
-    assert line.startswith("estimator_node: ")
-    assert line.endswith(sentence)
 
 
 def test_unknown_arguments_end_the_node_with_one_sentence(tmp_path: Path, swarm_file: Path) -> None:

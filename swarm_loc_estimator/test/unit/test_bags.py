@@ -77,6 +77,14 @@ def write_sqlite(path: Path, messages: list[tuple[str, int, bytes]]) -> Path:
     return path / f"{path.name}.db3"
 
 
+def stored(folder: Path, storage: str, messages: list[tuple[str, int, bytes]]) -> Path:
+    """A file of either storage."""
+    if storage == "db3":
+        return write_sqlite(folder / "bag", messages)
+    write_mcap(folder / "x.mcap", messages)
+    return folder / "x.mcap"
+
+
 def read(path: Path) -> tuple[list[RawMessage], list[str]]:
     with BagReader(path) as bag:
         return list(bag.messages()), bag.losses
@@ -155,12 +163,7 @@ def test_sqlite(tmp_path: Path) -> None:
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 def test_topics_are_chosen_and_progress_grows_to_one(tmp_path: Path, storage: str) -> None:
     messages = some_messages(2000)
-    path = tmp_path / "x.mcap"
-    if storage == "mcap":
-        write_mcap(path, messages)
-    else:
-        path = write_sqlite(tmp_path / "bag", messages)
-    with BagReader(path) as bag:
+    with BagReader(stored(tmp_path, storage, messages)) as bag:
         chosen, progress = [], []
         for message in bag.messages(["/a/odom"]):
             chosen.append(message)
@@ -246,10 +249,7 @@ def test_damage_anywhere_never_raises_anything_else(
 ) -> None:
     path = tmp_path / f"whole.{storage}"
     if not path.exists():
-        if storage == "mcap":
-            write_mcap(path, some_messages(100))
-        else:
-            write_sqlite(tmp_path / "bag", some_messages(100)).rename(path)
+        stored(tmp_path, storage, some_messages(100)).rename(path)
     data = bytearray(path.read_bytes())
     for place, replacement in places:
         begin = int(place * len(data))
@@ -364,12 +364,8 @@ def one_peak_of_reading(path: Path) -> int:
 def test_memory_does_not_grow_with_the_bag(tmp_path: Path, storage: str) -> None:
     peaks = []
     for count in (3000, 12000):  # all of the second together take three times what is allowed
-        if storage == "mcap":
-            path = tmp_path / f"{count}.mcap"
-            write_mcap(path, some_messages(count))
-        else:
-            path = write_sqlite(tmp_path / str(count), some_messages(count))
-        peaks.append(peak_of_reading(path))
+        (tmp_path / str(count)).mkdir()
+        peaks.append(peak_of_reading(stored(tmp_path / str(count), storage, some_messages(count))))
     assert peaks[1] < 1.1 * peaks[0] + 50_000
 
 

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,10 +40,13 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 BEGIN_NS, STEP_NS = 1_700_000_000_000_000_000, 1_000_000_000
 SPREAD = 0.1
+Told = Callable[[FloatArray], FloatArray]
 UNKNOWN_ID = 99
 
 
-def described(names: tuple[str, ...], platform: IrPlatform, source: str, first_id: int = 1) -> list[Robot]:
+def described(names: str, first_id: int = 1, source: str = "droplet") -> list[Robot]:
+    """Robots of one letter each."""
+    platform = droplet(SPREAD) if source == "droplet" else load_ir_platform(source)
     return [Robot(n, camera=None, ir=RobotIr(first_id + k, platform, source)) for k, n in enumerate(names)]
 
 
@@ -51,7 +55,7 @@ def write_exchanges(
     robots: list[Robot],
     count: int,
     seed: int,
-    told: Callable[[FloatArray], FloatArray] = lambda pose: pose,
+    told: Told | None = None,
     truly: IrPlatform | None = None,
 ) -> FloatArray:
     """Robots that are somewhere else at every exchange, and the ground truth `told` of where they are.
@@ -84,7 +88,9 @@ def write_exchanges(
             bag.write(f"{name}/brightness", stamp_ns, data)
         poses = ((receiver[k], places[k]), (transmitter[k], se2.compose(places[k], seen[k])))
         for robot, pose in poses:
-            data = encode_pose_stamped("map", np.array([stamp_ns]), np.atleast_2d(told(pose)))[0]
+            data = encode_pose_stamped(
+                "map", np.array([stamp_ns]), np.atleast_2d(told(pose) if told else pose)
+            )[0]
             bag.write(f"{robots[robot].name}/ground_truth", stamp_ns, data)
     return logs
 
@@ -95,18 +101,11 @@ def add_topics(bag: BagWriter, robots: list[Robot]) -> None:
         bag.add_topic(f"{robot.name}/ground_truth", POSE_STAMPED)
 
 
-def recorded(
-    folder: Path,
-    robots: list[Robot],
-    count: int,
-    seed: int,
-    told: Callable[[FloatArray], FloatArray] = lambda pose: pose,
-    truly: IrPlatform | None = None,
-) -> FloatArray:
+def recorded(folder: Path, robots: list[Robot], count: int, seed: int, **others: Any) -> FloatArray:
     """A bag with its swarm.yaml; returns the true log-gains."""
     with BagWriter(folder) as bag:
         add_topics(bag, robots)
-        logs = write_exchanges(bag, robots, count, seed, told, truly)
+        logs = write_exchanges(bag, robots, count, seed, **others)
     save_swarm(Swarm(tuple(robots)), folder / "swarm.yaml")
     return logs
 
@@ -129,7 +128,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 def test_gains_come_out_within_their_sigmas_and_are_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], seed: int
 ) -> None:
-    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    robots = described("abc")
     logs = recorded(tmp_path / "bag", robots, 300, seed)
     out = tmp_path / "made" / "calibrated.yaml"
     assert calibrate_ir.main([str(tmp_path / "bag"), "--out", str(out), *options]) == 0
@@ -162,8 +161,8 @@ def test_each_kind_of_board_is_calibrated_by_itself_and_what_is_wrong_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A pair of Droplets, a pair of other boards, a robot that nobody heard, and a stranger."""
-    droplets = described(("a", "b", "alone"), droplet(SPREAD), "droplet")
-    others = described(("c", "d"), load_ir_platform("epuck_twelve"), "epuck_twelve", first_id=10)
+    droplets = described("abx")
+    others = described("cd", 10, "epuck_twelve")
     earlier = IrGains((1.1,) * 6, (1.0,) * 6, 0.02)
     assert droplets[2].ir is not None
     droplets[2] = replace(droplets[2], ir=replace(droplets[2].ir, gains=earlier))
@@ -181,7 +180,7 @@ def test_each_kind_of_board_is_calibrated_by_itself_and_what_is_wrong_is_told(
     wrong = "1 ir_hears_itself, 1 ir_other_board, 1 ir_unknown_id, 1 ir_wrong_receiver"
     assert f"Matrices not used: {wrong}." in shown
     assert "No robot of the swarm description has the topics stranger/brightness." in shown
-    assert "as they were: alone." in shown
+    assert "as they were: x." in shown
     assert "platform droplet: " in shown
     assert "platform epuck_twelve: " in shown
     a, _, alone, c, _ = gains_of(tmp_path / "out.yaml")
@@ -195,8 +194,8 @@ def test_each_kind_of_board_is_calibrated_by_itself_and_what_is_wrong_is_told(
 def test_a_board_that_cannot_be_calibrated_does_not_keep_others_from_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    droplets = described(("a", "b"), droplet(SPREAD), "droplet")
-    others = described(("c", "d"), load_ir_platform("epuck_twelve"), "epuck_twelve", first_id=10)
+    droplets = described("ab")
+    others = described("cd", 10, "epuck_twelve")
     with BagWriter(tmp_path / "bag") as bag:
         add_topics(bag, [*droplets, *others])
         write_exchanges(bag, droplets, 100, 5)
@@ -210,7 +209,7 @@ def test_what_cannot_be_calibrated_is_said_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag, swarm = tmp_path / "bag", tmp_path / "other.yaml"
-    robots = described(("a", "b"), droplet(SPREAD), "droplet")
+    robots = described("ab")
     recorded(bag, robots, MIN_EXCHANGES - 1, 6)
     few = f"{MIN_EXCHANGES - 1} exchanges are too few, {MIN_EXCHANGES} are the least"
     assert f"recording 'bag': Platform droplet: {few}." in error_of(capsys, bag)
@@ -218,10 +217,10 @@ def test_what_cannot_be_calibrated_is_said_in_one_sentence(
     assert "missing.yaml" in error_of(capsys, bag, "--swarm", tmp_path / "missing.yaml")
     save_swarm(Swarm((Robot("a"), Robot("b"))), swarm)
     assert "no robot of the swarm description has an infrared" in error_of(capsys, bag, "--swarm", swarm)
-    save_swarm(Swarm(tuple(described(("a", "b"), droplet(SPREAD), "droplet", first_id=50))), swarm)
+    save_swarm(Swarm(tuple(described("ab", 50))), swarm)
     unknown = error_of(capsys, bag, "--swarm", swarm)
     assert f"can be used: {2 * MIN_EXCHANGES - 2} ir_unknown_id." in unknown
-    save_swarm(Swarm(tuple(described(("x", "y"), droplet(SPREAD), "droplet"))), swarm)
+    save_swarm(Swarm(tuple(described("xy"))), swarm)
     sentence = "recording 'bag' holds no <robot>/brightness of this swarm that can be used."
     strangers = "No robot of the swarm description has the topics a/brightness, b/brightness."
     assert f"{sentence} {strangers}" in error_of(capsys, bag, "--swarm", swarm)
@@ -232,9 +231,9 @@ def test_ground_truth_that_contradicts_what_was_read_calibrates_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of another run, say: gains less sure than before would come out of it."""
-    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    robots = described("abc")
     rng = np.random.default_rng(8)
-    recorded(tmp_path / "bag", robots, 60, 8, lambda _: rng.uniform(-0.15, 0.15, 3))
+    recorded(tmp_path / "bag", robots, 60, 8, told=lambda _: rng.uniform(-0.15, 0.15, 3))
     said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml")
     assert "What they read contradicts itself or the ground truth, and as they were: a, b, c." in said
     assert not (tmp_path / "out.yaml").exists()
@@ -246,7 +245,7 @@ def test_robots_are_not_blamed_where_the_curves_of_their_board_are_wrong(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], seed: int
 ) -> None:
     """Lobes as wide as those of real Droplets, described as the paper has them."""
-    robots, real = described(("a", "b", "c"), droplet(SPREAD), "droplet"), load_ir_platform("droplet_2016")
+    robots, real = described("abc"), load_ir_platform("droplet_2016")
     truly = replace(droplet(SPREAD), sensor=real.sensor, emitter=real.emitter)
     recorded(tmp_path / "bag", robots, 100, seed, truly=truly)
     said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml", *options)
@@ -258,7 +257,7 @@ def test_robots_are_not_blamed_where_the_curves_of_their_board_are_wrong(
 def test_a_saturation_that_is_lower_than_described_is_told_where_gains_fail_by_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    robots = described("abc")
     recorded(tmp_path / "bag", robots, 300, 14, truly=replace(droplet(SPREAD), saturation=180.0))
     said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml", "--without-truth")
     assert "Platform droplet: Sensors saturate lower than board and matrices say: a [0, " in said
@@ -285,20 +284,21 @@ def line(exchange: Exchange) -> str:
     return f"{{{ids}, {{{rows}}}, {exchange.time_s:.3f}, {{{seen}}}}},"
 
 
+def pose_at(robot: int) -> FloatArray:
+    """Heading is the fiducial's orientation and a quarter turn, of the root a half."""
+    x, y, orientation = PLACES[robot]
+    turned = orientation + (2 if robot == ROOT else 1) * QUARTER
+    return np.array([METRES_PER_PIXEL * x, METRES_PER_PIXEL * y, turned])
+
+
 def exchanges(seed: int = 0, count: int = 60) -> list[Exchange]:
-    """Robots that stand; heading is the fiducial's orientation and a quarter turn, of the root a half."""
+    """Robots that stand."""
     rng = np.random.default_rng(seed)
     platform = replace(load_ir_platform("droplet_2016"), noise=1.0)
     done = []
     for k in range(count):
         transmitter = (0xA, 0xB, 0xC)[k % 3]
-        poses = {
-            robot: np.array(
-                [METRES_PER_PIXEL * x, METRES_PER_PIXEL * y, o + (2 if robot == ROOT else 1) * QUARTER]
-            )
-            for robot, (x, y, o) in PLACES.items()
-        }
-        x, y, heading = se2.between(poses[ROOT][None], poses[transmitter][None])[0]
+        x, y, heading = se2.between(pose_at(ROOT), pose_at(transmitter))
         light = expected_brightness(platform, [[math.hypot(x, y), math.atan2(y, x), heading]])[0, 0]
         readings = np.rint(np.minimum(light + 15.0 * rng.standard_normal(light.shape), 2400.0))
         seen = tuple(Sighting(robot, *place) for robot, place in PLACES.items())
@@ -368,11 +368,7 @@ def test_the_bag_holds_the_truth_however_the_image_is_turned(tmp_path: Path, mir
     names = [swarm.robots[index].name for index in board.robots]
     for place, pose in zip(board.data.transmitter, board.data.poses, strict=True):
         robot = int(names[place].removeprefix("droplet_"), 16)
-        x, y, o = PLACES[ROOT]
-        other = PLACES[robot]
-        there = np.array([[METRES_PER_PIXEL * other[0], METRES_PER_PIXEL * other[1], other[2] + QUARTER]])
-        here = np.array([[METRES_PER_PIXEL * x, METRES_PER_PIXEL * y, o + 2 * QUARTER]])
-        dx, dy, heading = se2.between(here, there)[0]
+        dx, dy, heading = se2.between(pose_at(ROOT), pose_at(robot))
         np.testing.assert_allclose(pose[0], math.hypot(dx, dy), atol=1e-6)
         off = se2.wrap_angle(pose[1:] - [math.atan2(dy, dx), heading])
         np.testing.assert_allclose(off, 0.0, atol=2e-3)  # orientations are printed to a tenth of a degree
@@ -398,8 +394,7 @@ def test_a_fiducial_that_is_misread_while_its_robot_stands_at_one_place_is_corre
     for where in truth.poses:
         for name, pose in where.items():
             heading = fiducials.pose(name, pose, METRES_PER_PIXEL)[2]
-            expected = PLACES[name][2] + (2 if name == ROOT else 1) * QUARTER
-            assert abs(float(se2.wrap_angle(heading - expected))) < 1e-6
+            assert abs(float(se2.wrap_angle(heading - pose_at(name)[2]))) < 1e-6
 
 
 def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:

@@ -48,20 +48,25 @@ class World:
         self.graph = Graph()
         self.diagnostics = Diagnostics(swarm, self.ingest, parameters, self.graph, ["swarm/poses"])
         self.reports = self.diagnostics.reports
+        self._all_tracked = [Status.TRACKED] * len(swarm.robots)
 
-    def _read(self, topic: str, data: bytes, now_ns: int) -> None:
-        list(
-            self.ingest.read(MessageBatch.of([SerializedMessage(self.ingest.handle_of[topic], data, now_ns)]))
-        )
+    def tracked(self, now_ns: int = 0, rows: Recent | None = None) -> list[Any]:
+        """Reports where all robots are tracked."""
+        return [*self.reports(now_ns, estimate(now_ns, *self._all_tracked), rows or recent(), {})]
+
+    def read(self, topic: str, data: bytes, now_ns: int) -> None:
+        """A message on a topic."""
+        message = SerializedMessage(self.ingest.handle_of[topic], data, now_ns)
+        list(self.ingest.read(MessageBatch.of([message])))
 
     def detections(self, now_ns: int) -> None:
         """A picture of robot a without any marker."""
         data = encode_detections("a/camera_optical_frame", now_ns, np.zeros(0, DETECTION_DTYPE))
-        self._read("a/detections", data, now_ns)
+        self.read("a/detections", data, now_ns)
 
     def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
         """One message."""
-        self._read(f"{robot}/odom", odometry_bytes(robot, stamp_ns, frame=frame), now_ns)
+        self.read(f"{robot}/odom", odometry_bytes(robot, stamp_ns, frame=frame), now_ns)
 
 
 def estimate(now_ns: int, *status: Status) -> Estimate:
@@ -90,27 +95,25 @@ def test_missing_topics_are_grouped_by_cause() -> None:
 
 def test_topics_with_too_many_publishers_are_named_where_they_belong() -> None:
     world = World()
-    tracked = estimate(0, Status.TRACKED, Status.TRACKED)
     world.odometry("b", 0, 0)
     world.graph.publishers = {"swarm/poses": ["/one", "/two"], "b/odom": ["/player", "/player"]}
-    a, b, whole = world.reports(0, tracked, recent(), {})
+    a, b, whole = world.tracked()
     assert "publishers" not in a.message
     assert (b.warning, b.message) == (True, "b/odom has 2 publishers: /player, /player")
     assert whole.message.startswith("swarm/poses has 2 publishers: /one, /two; no messages received")
     assert world.diagnostics.duplicate_publishers == [whole.message.partition(";")[0], b.message]
     world.graph.publishers = {}
-    _, b, _ = world.reports(0, tracked, recent(), {})
+    _, b, _ = world.tracked()
     assert (b.warning, world.diagnostics.duplicate_publishers) == (False, [])
 
 
 def test_rates_and_lateness_are_those_of_the_interval() -> None:
     world = World()
-    both = (Status.TRACKED, Status.TRACKED)
     world.odometry("b", 1 * SECOND, 2 * SECOND)
-    world.reports(10 * SECOND, estimate(10 * SECOND, *both), recent(), {})
+    world.tracked(10 * SECOND)
     for k in range(4):
         world.odometry("b", 10 * SECOND, 10 * SECOND + k * SECOND // 2)
-    _, b, _ = world.reports(12 * SECOND, estimate(12 * SECOND, *both), recent(), {})
+    _, b, _ = world.tracked(12 * SECOND)
     assert b.values["odom received"] == "5"
     assert b.values["odom rate [1/s]"] == "2"
     assert b.values["odom age [s]"] == "0.5"
@@ -125,11 +128,10 @@ def test_each_pair_of_radios_has_figures_of_its_own() -> None:
     robots = (Robot(f"r{one.address}", camera=None, uwb=one) for one in radios)
     world = World(Swarm(tuple(robots), range_topic="uwb/{from}/{to}"))
     for topic, count in (("uwb/1/2", 3), ("uwb/1/3", 1)):
-        handle = world.ingest.handle_of[topic]
         for k in range(count):
             data = encode({"header": {"stamp": k * SECOND}, "range": 1.0}, RANGE)
-            list(world.ingest.read(MessageBatch.of([SerializedMessage(handle, data, k * SECOND)])))
-    first = world.reports(SECOND, estimate(SECOND, *[Status.TRACKED] * 3), recent(), {})[0]
+            world.read(topic, data, k * SECOND)
+    first = world.tracked(SECOND)[0]
     found = {name: value for name, value in first.values.items() if str(name).endswith(" received")}
     assert found["uwb/1/2 received"] == "3"
     assert found["uwb/1/3 received"] == "1"
@@ -141,7 +143,7 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     _, b, whole = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {"gated": 3})
     assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
     assert whole.values == {"dropped: gated": 3}
-    world.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
+    world.tracked()
     losses = [None, LossReport(1, LossReason.OFF_MAP, -3 * SECOND, "its scans contradict the map")]
     waiting = estimate(0, Status.TRACKED, Status.WAITING)
     _, b, _ = world.reports(0, waiting, recent(), {}, losses=losses)
@@ -150,7 +152,7 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     _, b, _ = world.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.STALE), recent(), {})
     assert b.message == "b/odom is silent for 5.0 s"
     world.odometry("b", now_ns, now_ns, frame="odom")
-    _, b, _ = world.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.TRACKED), recent(), {})
+    _, b, _ = world.tracked(now_ns)
     assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
 
 
@@ -181,8 +183,7 @@ def test_delays_of_another_clock_do_not_overflow() -> None:
     world, now_ns = World(), 1_700_000_000 * SECOND
     for _ in range(20):
         world.odometry("b", 0, now_ns)
-    tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
-    _, b, _ = world.reports(now_ns, tracked, recent(), {})
+    _, b, _ = world.tracked(now_ns)
     assert float(str(b.values["odom lateness mean [s]"])) == pytest.approx(1.7e9)
 
 
@@ -191,16 +192,14 @@ def test_a_robot_with_a_clock_of_its_own_is_named() -> None:
     for late_s, problem in ((0.3, "has a clock 0.3 s behind those of the other robots"), (0.1, "tracked")):
         for name, one_s in (("a", 0.0), ("b", late_s), ("c", 0.0)):
             world.odometry(name, now_ns - round(one_s * SECOND), now_ns)
-        _, b, _, _ = world.reports(now_ns, estimate(now_ns, *[Status.TRACKED] * 3), recent(), {})
-        assert b.message == problem
+        assert world.tracked(now_ns)[1].message == problem
 
 
 def test_with_transforms_per_robot_frames_have_no_prefix() -> None:
     world, now_ns = World(tf_per_robot=True), 10 * SECOND
     for frame, message in (("odom", "tracked"), ("b/odom", "b/odom is in frame 'b/odom' but transforms are")):
         world.odometry("b", now_ns, now_ns, frame=frame)
-        tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
-        assert world.reports(now_ns, tracked, recent(), {})[1].message.startswith(message)
+        assert world.tracked(now_ns)[1].message.startswith(message)
 
 
 def test_a_robot_that_is_too_uncertain_is_named() -> None:
@@ -234,15 +233,14 @@ def test_a_detector_that_falls_silent_is_named_as_soon_as_its_period_allows(
     for late_s, message in ((-0.1, "tracked"), (0.1, f"a/detections is silent for {patience_s + 0.1:.1f} s")):
         now_ns = last_ns + round((patience_s + late_s) * SECOND)
         world.odometry("a", now_ns, now_ns)
-        status = estimate(now_ns, Status.TRACKED, Status.TRACKED)
-        assert world.reports(now_ns, status, recent(), {})[0].message == message
+        assert world.tracked(now_ns)[0].message == message
 
 
 def test_nis_is_the_mean_of_what_was_used() -> None:
     rows = recent(
         (0, Verdict.USED, 2.0), (0, Verdict.USED, 4.0), (0, Verdict.GATED, 900.0), (-1, Verdict.USED, 7.0)
     )
-    a, b, _ = World().diagnostics.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), rows, {})
+    a, b, _ = World().tracked(rows=rows)
     assert (a.values["measurements used"], a.values["NIS mean"]) == ("2", "3")
     assert (b.values["measurements used"], b.values["NIS mean"]) == ("0", "-")
 
@@ -267,8 +265,7 @@ def test_a_robot_whose_scans_are_all_unused_is_not_ok(verdict: Verdict, said: st
     found = {}
     for used in (verdict, Verdict.USED):
         verdicts = np.array([verdict, used, verdict], dtype=np.uint8)
-        recent = (scans, verdicts, np.full(3, np.nan))
-        found[used] = world.reports(9, estimate(9, Status.TRACKED, Status.TRACKED), recent, {})
+        found[used] = world.tracked(9, (scans, verdicts, np.full(3, np.nan)))
     assert f"none of its last 3 scans is used: they {said}" in found[verdict][0].message
     assert found[verdict][0].warning
     assert "scans" not in found[verdict][1].message + found[Verdict.USED][0].message

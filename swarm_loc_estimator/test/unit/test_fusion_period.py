@@ -1,5 +1,6 @@
 """When measurements are fused and in which parts, and which are left out where time is short."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -208,8 +209,7 @@ def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_t
     state = SwarmState(ParameterTable.of((Robot("a"),), ()))
     timeline = Timeline(Settings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
     stamp_ns = T0 + PERIOD_NS * np.arange(1, 6, dtype=np.int64)
-    every = np.tile(np.eye(3), (stamp_ns.size, 1, 1))
-    timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, CARTESIAN))
+    timeline.add(fixes(stamp_ns))
     timeline.advance(int(stamp_ns[-1]), lambda: False)
     assert stepped == [stamp_ns[0]]
     timeline.invalidate(np.array([T0]))
@@ -298,37 +298,40 @@ def test_all_is_used_again_when_the_load_has_fallen() -> None:
     assert machine.shedding.share == 1.0
 
 
+def busy(
+    shedding: Shedding,
+    ticks: range,
+    fusing_s: Callable[[float], float],
+    tick_s: float = 1.0,
+    come_s: float = 1.0,
+) -> list[float]:
+    """Ticks that take as long as they are apart; how long each fuses, given the share that is used [s]."""
+    taken = []
+    for tick in ticks:
+        shedding.begin_tick(tick_s * tick, come_s)
+        shedding.begin_fusion()
+        taken.append(fusing_s(shedding.share))
+        shedding.note(tick_s, taken[-1])
+    return taken
+
+
 def test_what_would_not_help_is_not_shed() -> None:
-    machine = Machine(fusing=0.09, rest=2.0)
-    for _ in range(100):  # so far behind that a tick takes as long as what came before it, and more
-        machine.shedding.begin_tick(machine.now_s, 1.0)
-        machine.shedding.begin_fusion()
-        machine.shedding.note(1.0, 0.04)
-        machine.now_s += 1.0
-    assert machine.shedding.share == 1.0
+    """So far behind that a tick takes as long as what came before it, and more."""
+    shedding = Shedding(0.1, HORIZON_S)
+    busy(shedding, range(100, 200), lambda _: 0.04)
+    assert shedding.share == 1.0
 
 
 def test_what_was_shed_in_vain_is_used_again_though_the_node_stays_busy() -> None:
     shedding = Shedding(0.1, HORIZON_S)
-    for second in range(20):
-        shedding.begin_tick(float(second), 1.0)
-        shedding.begin_fusion()
-        shedding.note(1.0, 0.9)
+    busy(shedding, range(20), lambda _: 0.9)
     assert shedding.share == MIN_SHARE
-    for second in range(20, 100):  # something else takes all the time, and fusing hardly any
-        shedding.begin_tick(float(second), 1.0)
-        shedding.begin_fusion()
-        shedding.note(1.0, 0.02 * shedding.share)
+    busy(shedding, range(20, 100), lambda share: 0.02 * share)  # something else takes nearly all the time
     assert shedding.share == 1.0
 
 
 def test_fusing_keeps_its_guaranteed_part_of_a_node_that_is_always_busy() -> None:
-    shedding, taken = Shedding(0.1, HORIZON_S), []
-    for second in range(400):
-        shedding.begin_tick(float(second), 1.0)
-        shedding.begin_fusion()
-        taken.append(min(2.0 * shedding.share, 0.9))
-        shedding.note(1.0, taken[-1])
+    taken = busy(Shedding(0.1, HORIZON_S), range(400), lambda share: min(2.0 * share, 0.9))
     assert min(taken[100:]) > 0.03
     assert max(taken[100:]) < 0.15
 
@@ -345,10 +348,7 @@ def test_a_node_that_is_busy_for_a_while_and_catches_up_again_leaves_nothing_out
 
 def test_a_node_that_is_always_busy_but_does_not_fall_behind_leaves_nothing_out() -> None:
     shedding = Shedding(0.1, HORIZON_S)
-    for tick in range(200):
-        shedding.begin_tick(0.1 * tick, 0.4)
-        shedding.begin_fusion()
-        shedding.note(0.1, 0.08)
+    busy(shedding, range(200), lambda _: 0.08, tick_s=0.1, come_s=0.4)
     assert shedding.share == 1.0
 
 

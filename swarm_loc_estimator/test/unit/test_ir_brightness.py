@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from ir_world import droplet, droplet_matrix, nees, pair_of, pose_errors, random_poses, readings_of
+from core_geometry import nees, slopes_of
+from ir_world import droplet, droplet_matrix, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
@@ -47,15 +48,8 @@ def test_readings_are_not_those_of_the_printed_equations(part: str) -> None:
 def test_slopes_are_those_of_the_readings(name: str) -> None:
     platform = load_ir_platform(name)
     poses = random_poses(40, 3, low=0.1)
-    slopes = expected_with_slopes(platform, poses)[1]
-    for column, step in enumerate((1e-8, 1e-7, 1e-7)):
-        ahead, behind = poses.copy(), poses.copy()
-        ahead[:, column] += step
-        behind[:, column] -= step
-        numeric = (expected_brightness(platform, ahead) - expected_brightness(platform, behind)) / (
-            2.0 * step
-        )
-        np.testing.assert_allclose(slopes[..., column], numeric, rtol=2e-4, atol=1e-3)
+    numeric = slopes_of(lambda change: expected_brightness(platform, poses + change), 3, (1e-8, 1e-7, 1e-7))
+    np.testing.assert_allclose(expected_with_slopes(platform, poses)[1], numeric, rtol=2e-4, atol=1e-3)
 
 
 def test_gains_multiply_readings_and_slopes() -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from core_geometry import nees, slopes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -12,7 +13,6 @@ from ir_world import (
     RHO,
     differing_gains,
     droplet,
-    nees,
     pair_of,
     pose_errors,
     random_poses,
@@ -250,12 +250,8 @@ def test_the_costs_gradient_is_its_slope(seed: int) -> None:
     pair = pair_of(droplet().model, readings, 255.0, gains, prior)
     at = np.concatenate([0.05 * rng.standard_normal(12), pose[0] * [1.01, 1.0, 1.0] + [0.0, 0.01, 0.02]])
     _, gradient, hessian = cost_at(pair, at)
-    for p in range(at.size):
-        ahead, behind, step = at.copy(), at.copy(), 1e-7
-        ahead[p] += step
-        behind[p] -= step
-        slope = (cost_at(pair, ahead)[0] - cost_at(pair, behind)[0]) / (2.0 * step)
-        assert gradient[p] == pytest.approx(slope, rel=1e-3, abs=0.05)
+    slopes = slopes_of(lambda change: cost_at(pair, at + change)[0], at.size, 1e-7)
+    assert gradient == pytest.approx(slopes, rel=1e-3, abs=0.05)
     assert np.linalg.eigvalsh(hessian).min() > 0.0
     prior_part = np.linalg.inv(np.linalg.inv(100.0 * (np.eye(6) - 0.1)))  # what two log-gains have in common
     without = pair_of(droplet().model, np.full_like(readings, np.nan), 255.0, gains, prior)
@@ -320,9 +316,11 @@ def test_readings_of_another_size_are_refused_in_one_sentence(shape: tuple[int, 
         ALIKE.solve(np.zeros(shape))
 
 
-def test_gains_of_another_number_of_pairs_are_refused() -> None:
+def test_gains_and_saturation_of_another_shape_are_refused() -> None:
     with pytest.raises(ReadingsError, match=r"gains have the shape \(3, 6\) but must have \(2, 6\)\."):
         ALIKE.solve(np.zeros((2, 2, 6, 6)), differing_gains(3, 6, 0.1, 1))
+    with pytest.raises(ReadingsError, match=r"saturation has the shape \(2, 3\) but must have \(2, 2\)\."):
+        ALIKE.solve(np.zeros((2, 2, 6, 6)), None, np.zeros((2, 3)))
 
 
 def test_no_pairs_give_no_solutions() -> None:
@@ -440,11 +438,6 @@ def test_a_limit_far_below_the_platforms_is_as_good_as_a_platform_that_ends_ther
     assert np.mean(apart.max(axis=1) < 0.1) > 0.98
 
 
-def test_saturation_of_another_shape_is_refused() -> None:
-    with pytest.raises(ReadingsError, match=r"saturation has the shape \(2, 3\) but must have \(2, 2\)\."):
-        ALIKE.solve(np.zeros((2, 2, 6, 6)), None, np.zeros((2, 3)))
-
-
 BOARD = load_ir_platform("droplet_2016")
 ESTIMATOR = MaximumLikelihood(BOARD)
 _CHI_SQUARE_99 = 11.345
@@ -503,16 +496,11 @@ def test_noise_alone_is_no_robot() -> None:
 def test_the_costs_gradient_is_its_slope_also_of_outliers(seed: int) -> None:
     pose = random_poses(1, seed, low=0.08, high=0.16)
     readings = np.roll(with_faults(pose, seed)[0], 1, axis=1)  # most are outliers now
-    model = BOARD.model
-    pair, work = pair_of(model, readings, 1e9), new_cost_workspace(1, 6, False)
+    pair, work = pair_of(BOARD.model, readings, 1e9), new_cost_workspace(1, 6, False)
 
-    def cost_at(at: FloatArray) -> tuple[float, FloatArray]:
-        cost = cost_of(model, pair, at, work, work.gradients[0], work.hessians[0])
-        return cost, work.gradients[0].copy()
+    def cost_at(at: FloatArray) -> float:
+        return cost_of(BOARD.model, pair, at, work, work.gradients[0], work.hessians[0])
 
-    _, gradient = cost_at(pose[0])
-    for p in range(3):
-        step = np.zeros(3)
-        step[p] = 1e-7
-        slope = (cost_at(pose[0] + step)[0] - cost_at(pose[0] - step)[0]) / 2e-7
-        assert gradient[p] == pytest.approx(slope, rel=1e-3, abs=0.05)
+    slopes = slopes_of(lambda change: cost_at(pose[0] + change), 3, 1e-7)
+    cost_at(pose[0])
+    assert work.gradients[0] == pytest.approx(slopes, rel=1e-3, abs=0.05)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_geometry import nees, wrapped
+from core_geometry import nees, slopes_of, wrapped
 from core_messages import SECOND, T0, Event, give_fix
 from core_run import on_time, play, ticks
 from core_world import Plan, World, simulate
@@ -158,10 +158,7 @@ def test_the_covariance_contains_the_lever_between_robot_and_body() -> None:
     offset, covariance = np.array([0.3, -0.2, 2.5]), FULL[np.ix_((0, 1, 5), (0, 1, 5))]
     bridge = Bridge(source="pose_with_covariance", offsets=("alpha=0.3,-0.2,2.5",))
     (found,) = bridge.take(message("pose_with_covariance", MESSAGES["pose_with_covariance"]))
-    step, jacobian = 1e-6, np.zeros((3, 3))
-    for k, axis in enumerate(np.eye(3)):
-        ends = [se2.compose(np.array(POSE) + sign * step * axis, se2.inverse(offset)) for sign in (1, -1)]
-        jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * step)
+    jacobian = slopes_of(lambda change: se2.compose(POSE + change, se2.inverse(offset)), 3)
     assert found.covariance == pytest.approx(jacobian @ covariance @ jacobian.T)
     assert found.covariance[0, 2] != pytest.approx(0.0)
 

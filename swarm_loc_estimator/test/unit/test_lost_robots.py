@@ -125,25 +125,22 @@ def test_a_loss_that_late_data_move_back_is_listed_once() -> None:
     assert runner.result("late", (T0, end_ns), {}, {}).losses == (*estimator.losses,)
 
 
+def remarks_of(swarm: Swarm, *losses: LossReport) -> list[str]:
+    none, waiting = np.zeros((1, len(swarm.robots), 3)), np.zeros((1, len(swarm.robots)), dtype=np.uint8)
+    columns = np.array([0]), none, none[..., None], waiting
+    return ReplayResult("x", swarm, *columns, losses=losses, heading_known=waiting > 0).loss_remarks
+
+
 def test_many_losses_are_listed_in_few_words() -> None:
-    losses = tuple(LossReport(k % 30, LossReason.GATED, k * SECOND, "gated") for k in range(600))
-    swarm = Swarm(tuple(Robot(f"r{k}") for k in range(30)))
-    none, waiting = np.zeros((1, 30, 3)), np.zeros((1, 30), dtype=np.uint8)
-    result = ReplayResult(
-        "many", swarm, np.array([0]), none, none[..., None], waiting, losses=losses, heading_known=waiting > 0
-    )
-    assert len(result.loss_remarks) == 21
-    assert result.loss_remarks[-1] == "10 more robots were lost."
-    assert max(map(len, result.loss_remarks)) < 150
+    losses = [LossReport(k % 30, LossReason.GATED, k * SECOND, "gated") for k in range(600)]
+    remarks = remarks_of(Swarm(tuple(Robot(f"r{k}") for k in range(30))), *losses)
+    assert len(remarks) == 21
+    assert remarks[-1] == "10 more robots were lost."
+    assert max(map(len, remarks)) < 150
 
 
 def test_the_end_of_a_local_frame_is_no_fault_in_the_report() -> None:
-    ended = (LossReport(0, LossReason.FRAME, 0, LOSS_CAUSES[LossReason.FRAME]),)
-    none, waiting = np.zeros((1, 1, 3)), np.zeros((1, 1), dtype=np.uint8)
-    result = ReplayResult(
-        "x", FIXED, np.array([0]), none, none[..., None], waiting, losses=ended, heading_known=waiting > 0
-    )
-    assert result.loss_remarks == []
+    assert remarks_of(FIXED, LossReport(0, LossReason.FRAME, 0, LOSS_CAUSES[LossReason.FRAME])) == []
 
 
 @pytest.mark.parametrize("period_s", [0.0, 0.2])

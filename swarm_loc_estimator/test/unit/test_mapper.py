@@ -36,12 +36,17 @@ def feed(mapper: CooperativeMapper, number: int, parts: Sequence[Readings]) -> N
         mapper.add_readings(number, part)
 
 
+def to_goal(mapper: CooperativeMapper, number: int, robot: RoomRobot) -> list[Readings]:
+    """What a robot reads on the way to its goal and around there."""
+    goal = mapper.goal(number)
+    assert goal is not None
+    return [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)]
+
+
 def explore(mapper: CooperativeMapper, number: int, robot: RoomRobot, hops: int) -> None:
     feed(mapper, number, look_around(robot))
     for _ in range(hops):
-        goal = mapper.goal(number)
-        assert goal is not None
-        feed(mapper, number, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
+        feed(mapper, number, to_goal(mapper, number, robot))
 
 
 def error_of(mapper: CooperativeMapper, number: int, robot: RoomRobot) -> tuple[float, float]:
@@ -94,13 +99,8 @@ def cut(readings: Readings, size: int) -> list[Readings]:
     """The same in messages of another size."""
     bounds = range(0, len(readings.stamp_ns), size)
     return [
-        Readings(
-            readings.stamp_ns[k : k + size],
-            readings.odometry[k : k + size],
-            readings.inverse[k : k + size],
-            readings.sigma,
-        )
-        for k in bounds
+        Readings(readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma)
+        for part in (slice(k, k + size) for k in bounds)
     ]
 
 
@@ -111,9 +111,7 @@ def test_the_size_of_messages_does_not_matter() -> None:
     recorded += look_around(robot)
     feed(whole, 0, recorded)
     for _ in range(2):
-        goal = whole.goal(0)
-        assert goal is not None
-        parts = [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)]
+        parts = to_goal(whole, 0, robot)
         feed(whole, 0, parts)
         recorded += parts
     for size in (1, 37):
@@ -141,9 +139,7 @@ def test_two_robots_share_a_map_and_one_may_leave() -> None:
     assert abs(mapper.graph.slip[number] - 0.03) < 0.004
     count = mapper.graph.count
     mapper.leave(number)
-    goal = mapper.goal(0)
-    assert goal is not None
-    feed(mapper, 0, [*first.go_to(goal.odometry), first.turn(SCAN_TURN)])
+    feed(mapper, 0, to_goal(mapper, 0, first))
     assert mapper.graph.count == count + 1
 
 
@@ -199,24 +195,20 @@ def test_a_robot_that_moves_unheard_while_its_driver_restarts_is_found_by_its_sc
 def test_a_robot_whose_wheels_turn_while_something_holds_it_is_where_its_scan_says(
     moves: float, seed: int
 ) -> None:
-    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(seed))
-    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    mapper, robot = mapped(seed, 3)
     while distance_in_room(*robot.pose) < 1.0:
         feed(mapper, 0, [robot.turn(0.5)])
     for _ in range(2):
         before = robot.pose[:2].copy()
         feed(mapper, 0, [robot.drive(0.7, moves), robot.turn(SCAN_TURN)])
         assert math.dist(before, robot.pose[:2]) == pytest.approx(moves * 0.7)
-        position, heading = error_of(mapper, 0, robot)
-        assert position < 0.03
-        assert heading < math.radians(2.0)
+        assert_near(mapper, 0, robot)
     assert mapper.counters["drives_held"] == 2
 
 
 @pytest.mark.parametrize("seed", [20, 21, 22])
 def test_a_lost_robot_that_something_holds_has_looked_from_one_place_only(seed: int) -> None:
-    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(seed))
-    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    mapper, robot = mapped(seed, 3)
     restart(robot, 2.1, 0.0)
     feed(mapper, 0, look_around(robot))
     while distance_in_room(*robot.pose) < 0.6:
@@ -320,11 +312,10 @@ def at_a_wrong_place(patch: pytest.MonkeyPatch) -> tuple[CooperativeMapper, Room
 def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, robot, before = at_a_wrong_place(monkeypatch)
     for _ in range(4):
-        goal = mapper.goal(0)
-        if goal is None:
+        if mapper.goal(0) is None:
             seek(mapper, robot)
         else:
-            feed(mapper, 0, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
+            feed(mapper, 0, to_goal(mapper, 0, robot))
     assert mapper.counters["places_taken_back"] > 0
     assert_near(mapper, 0, robot)
     assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
@@ -458,11 +449,7 @@ def test_a_start_that_is_far_from_where_scans_put_it_stays_as_told() -> None:
 
 
 def heading_by_lights(
-    mapper: CooperativeMapper,
-    start: FloatArray,
-    turn: FloatArray,
-    seen: BoolArray,
-    bearing: FloatArray,
+    mapper: CooperativeMapper, start: FloatArray, turn: FloatArray, seen: BoolArray, bearing: FloatArray
 ) -> float:
     """The heading of a robot that turns like another one at the origin, whose light alone it sees (k,)."""
     sigma = np.array([0.01, 0.01, math.radians(8.0)])

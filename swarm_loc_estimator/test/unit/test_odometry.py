@@ -67,6 +67,15 @@ def test_headings_across_a_half_turn_are_followed() -> None:
     assert look(track, T0 + 8 * SECOND).pose[0, 2] == pytest.approx(8.0, abs=1e-9)
 
 
+def sampled_covariance(pose: FloatArray, mean: FloatArray) -> FloatArray:
+    """That of errors exp(xi) = sample times mean^-1 of poses (k, 3), to first order the entries of xi."""
+    turned = pose[:, 2] - mean[2]
+    cos, sin = np.cos(turned), np.sin(turned)
+    x = pose[:, 0] - (cos * mean[0] - sin * mean[1])
+    y = pose[:, 1] - (sin * mean[0] + cos * mean[1])
+    return np.cov(np.stack([x, y, turned]))
+
+
 @pytest.mark.parametrize(("speed", "turn_rate"), [(0.2, 0.0), (0.2, 1.5), (0.0, 2.0)])
 def test_preintegrated_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float) -> None:
     """Wheels with covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|); the error is taken in the track's frame."""
@@ -81,14 +90,7 @@ def test_preintegrated_noise_is_that_of_sampled_wheels(speed: float, turn_rate: 
         path, turn = wheels.mean(axis=1), (wheels[:, 0] - wheels[:, 1]) / width
         middle = pose[:, 2] + 0.5 * turn
         pose += np.column_stack([path * np.cos(middle), path * np.sin(middle), turn])
-    turned = pose[:, 2] - raw[-1, 2]
-    cos, sin = (
-        np.cos(turned),
-        np.sin(turned),
-    )  # the error exp(xi) = sample times mean^-1, to first order its entries
-    x = pose[:, 0] - (cos * raw[-1, 0] - sin * raw[-1, 1])
-    y = pose[:, 1] - (sin * raw[-1, 0] + cos * raw[-1, 1])
-    sampled = np.cov(np.stack([x, y, turned]))
+    sampled = sampled_covariance(pose, raw[-1])
     covariance = look(track, int(stamps[-1])).covariance[0]
     np.testing.assert_allclose(covariance, sampled, atol=0.05 * np.abs(covariance).max())
     np.testing.assert_allclose(np.diag(covariance), np.diag(sampled), rtol=0.08, atol=2e-6)
@@ -116,11 +118,7 @@ def test_preintegrated_noise_is_that_of_sampled_steps_in_any_direction(course: f
         middle = pose[:, 2] + 0.5 * turn + course
         cos, sin = np.cos(middle), np.sin(middle)
         pose += np.column_stack([cos * along - sin * across, sin * along + cos * across, turn])
-    turned = pose[:, 2] - heading
-    cos, sin = np.cos(turned), np.sin(turned)
-    x = pose[:, 0] - (cos * way[-1, 0] - sin * way[-1, 1])
-    y = pose[:, 1] - (sin * way[-1, 0] + cos * way[-1, 1])
-    sampled = np.cov(np.stack([x, y, turned]))
+    sampled = sampled_covariance(pose, np.array([*way[-1], heading]))
     covariance = look(track, int(stamps[-1])).covariance[0]
     np.testing.assert_allclose(covariance[:2, :2], sampled[:2, :2], atol=0.05 * np.abs(sampled[:2, :2]).max())
     np.testing.assert_allclose(covariance, sampled, atol=0.05 * np.abs(sampled).max())
@@ -183,10 +181,8 @@ def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
     for batch in np.array_split(conflicting, rng.integers(1, 30)):
         shuffled.extend(robots[batch], all_stamps[batch], rows[batch])
     who, when = np.repeat([0, 1], 80), np.tile(T0 + np.arange(80) * STEP_NS // 2 * 2 + 7_000_000, 2)
-    for name in ("pose", "raw", "covariance", "jacobian", "silence_s"):
-        np.testing.assert_allclose(
-            getattr(shuffled.at(who, when), name), getattr(orderly.at(who, when), name), atol=1e-12
-        )
+    for found, expected in zip(shuffled.at(who, when), orderly.at(who, when), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -327,10 +323,8 @@ def test_trimming_and_growing_keep_look_ups() -> None:
         trimmed.trim(now_ns - 2 * SECOND, now_ns - 4 * SECOND)
         when = now_ns - np.arange(0, 4 * SECOND, 230_000_000)
         who = np.zeros(when.size, dtype=np.int64)
-        for name in ("pose", "raw", "covariance", "jacobian", "silence_s"):
-            np.testing.assert_array_equal(
-                getattr(trimmed.at(who, when), name), getattr(kept.at(who, when), name)
-            )
+        for found, expected in zip(trimmed.at(who, when), kept.at(who, when), strict=True):
+            np.testing.assert_array_equal(found, expected)
     assert trimmed.arrays.stamp_ns.shape[1] == capacity
     assert kept.arrays.stamp_ns.shape[1] > capacity
     assert feed(trimmed, np.array([T0 + 100 * SECOND]), np.zeros((1, 3))).too_old.size == 1

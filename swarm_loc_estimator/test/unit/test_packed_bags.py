@@ -29,6 +29,7 @@ from test_bags import (
     read,
     record_of,
     some_messages,
+    stored,
     write_bag,
     write_mcap,
     write_sqlite,
@@ -60,11 +61,8 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_compressed_file_is_read_and_leaves_nothing(
     tmp_path: Path, temporary: Path, suffix: str, storage: str
 ) -> None:
-    messages, plain = some_messages(300), tmp_path / "x.mcap"
-    if storage == "mcap":
-        write_mcap(plain, messages)
-    else:
-        plain = write_sqlite(tmp_path / "bag", messages)
+    messages = some_messages(300)
+    plain = stored(tmp_path, storage, messages)
     path = tmp_path / f"y.{storage}{suffix}"
     path.write_bytes(PACK[suffix](plain.read_bytes()))
     assert read(path) == (expected(messages), [])

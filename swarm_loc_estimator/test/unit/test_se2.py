@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_geometry import planar, wrapped
+from core_geometry import planar, slopes_of, wrapped
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -90,11 +90,7 @@ def test_everything_works_on_any_leading_shape_as_on_single_poses() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_errors_of_a_pose_follow_from_its_right_invariant_error(seed: int) -> None:
     (pose,) = poses(seed, 1)
-    step = 1e-6
-    numeric = np.zeros((3, 3))
-    for j in range(3):
-        ahead, behind = (se2.compose(se2.exp(s * step * np.eye(3)[j]), pose) for s in (1, -1))
-        numeric[:, j] = (ahead - behind) / (2 * step)
+    numeric = slopes_of(lambda change: se2.compose(se2.exp(change), pose), 3)
     np.testing.assert_allclose(se2.error_to_pose_jacobian(pose), numeric, atol=1e-8)
 
 

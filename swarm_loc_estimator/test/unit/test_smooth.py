@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_geometry import homogeneous, marker_frame, seen
+from core_geometry import homogeneous, marker_frame, seen, slopes_of
 from core_messages import detection, joined
 from core_run import recording_of
 from core_world import Plan, World, simulate
@@ -223,12 +223,10 @@ def test_jacobians_are_those_of_finite_differences(off: float) -> None:
 
     here = evaluated(np.zeros(size))
     jacobian = np.concatenate(here.rows)
-    for unknown in range(size):
-        step = 1e-6 * np.eye(size)[unknown]
-        ahead, behind = (np.concatenate(evaluated(one).residuals) for one in (step, -step))
-        slope = (ahead - behind) / 2e-6
+    slopes = slopes_of(lambda step: np.concatenate(evaluated(step).residuals), size)
+    for column, slope in zip(jacobian.T, slopes.T, strict=True):
         # the growth of noise with a corrected distance is linearized, too
-        np.testing.assert_allclose(jacobian[:, unknown], slope, atol=0.02 * max(1.0, np.abs(slope).max()))
+        np.testing.assert_allclose(column, slope, atol=0.02 * max(1.0, np.abs(slope).max()))
     assert off > 0.0 or np.abs(jacobian).max(axis=0).min() > 0.1
 
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.filter.joint_filter import DenseFilter, Robots
+from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sparse import ordering
@@ -46,59 +45,7 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
-SIGMA = np.array([0.02, 0.02, 0.035])
 START = np.diag([1e-4, 1e-4, 4e-4])
-
-
-class Both:
-    """A dense and a sparse filter of the same bodies, given the same."""
-
-    def __init__(self, places: FloatArray, seed: int = 0) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.places = places
-        table = ParameterTable.of([Robot(str(body)) for body in range(len(places))], in_blocks=True)
-        self.filters = DenseFilter(table.filter_size), SparseFilter(table)
-        for body, place in enumerate(places):
-            for one in self.filters:
-                one.set_prior(3 * body + np.arange(3), error_covariance(np.append(place, 0.3), START))
-
-    def predict(self) -> None:
-        """Let all bodies drive."""
-        dense, sparse = self.filters
-        for body, place in enumerate(self.places):
-            noise = error_covariance(np.append(place, 0.0), np.diag([1e-7, 1e-8, 2e-6]))
-            own = slice(3 * body, 3 * body + 3)
-            dense.covariance[own, own] += noise
-            sparse.marginal[body] += noise
-
-    def update(self, pairs: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Use a measurement of each pair (m, 2), -1 being the map; return corrections."""
-        count = len(pairs)
-        columns = np.zeros((count, 8), dtype=np.int64)
-        jacobian = np.zeros((count, 3, 8))
-        for k, (a, b) in enumerate(pairs):
-            columns[k, :3], columns[k, 3:6] = 3 * max(a, 0) + np.arange(3), 3 * max(b, 0) + np.arange(3)
-            x, y = self.places[max(a, b)]
-            chain = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-            jacobian[k, :, :3] = -chain if a >= 0 else 0.0
-            jacobian[k, :, 3:6] = chain if b >= 0 else 0.0
-        innovation = SIGMA * self.rng.standard_normal((count, 3))
-        noise = np.tile(np.diag(SIGMA**2), (count, 1, 1))
-        first = np.where(pairs >= 0, 3 * pairs, -1)
-        robots, related = Robots(self.places, np.ones(len(self.places), dtype=bool)), np.zeros((count, 3, 6))
-        self.filters[1].prepare_update(np.column_stack([first, np.full(count, -1)]), robots, related)
-        dense, sparse = (one.update(columns, jacobian, innovation, noise) for one in self.filters)
-        return dense, sparse
-
-    def marginals(self) -> tuple[FloatArray, FloatArray]:
-        """Covariances (n, 3, 3) of poses by either filter."""
-        out = []
-        for one in self.filters:
-            blocks = [one.block(3 * body + np.arange(3)) for body in range(len(self.places))]
-            lever = np.tile(np.eye(3), (len(blocks), 1, 1))
-            lever[:, 0, 2], lever[:, 1, 2] = -self.places[:, 1], self.places[:, 0]
-            out.append(lever @ np.array(blocks) @ lever.transpose(0, 2, 1))
-        return out[0], out[1]
 
 
 def grid(count: int) -> FloatArray:
@@ -111,19 +58,6 @@ def grid(count: int) -> FloatArray:
 def neighbours(places: FloatArray, reach: float = 0.8) -> IntArray:
     gap = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     return np.argwhere((gap < reach) & (gap > 0.0))
-
-
-def test_many_fronts_are_nearly_exact() -> None:
-    places = grid(100)
-    both, pairs = Both(places), neighbours(places)
-    pairs = np.concatenate([pairs, [[-1, 0]]])
-    for _ in range(60):
-        both.predict()
-        dense, sparse = both.update(pairs[both.rng.uniform(size=len(pairs)) < 0.4])
-    exact, nearly = both.marginals()
-    ratio = np.trace(nearly, axis1=1, axis2=2) / np.trace(exact, axis1=1, axis2=2)
-    assert 0.9 < ratio.min() < ratio.max() < 1.1
-    assert np.linalg.norm(sparse - dense) < 0.1 * np.linalg.norm(dense)
 
 
 def test_what_is_contradicted_is_estimated() -> None:
@@ -187,10 +121,16 @@ KINDS = (
 """Everything is estimated of the first, of others only something, of the last nothing."""
 
 
-class BothParameters:
-    """A dense and a sparse filter of the same robots and landmarks, given the same."""
+class Both:
+    """A dense and a sparse filter of the same robots and landmarks, given the same.
 
-    def __init__(self, robots: int, seed: int, kinds: tuple[Robot, ...] = KINDS) -> None:
+    Attributes:
+        exact: The last correction by the dense filter.
+    """
+
+    def __init__(
+        self, robots: int, seed: int, kinds: tuple[Robot, ...] = KINDS, places: FloatArray | None = None
+    ) -> None:
         self.rng = np.random.default_rng(seed)
         described = [replace(kinds[k % len(kinds)], name=f"r{k}") for k in range(robots)]
         marks = [
@@ -199,9 +139,8 @@ class BothParameters:
         ]
         tables = [ParameterTable.of(described, marks, in_blocks=sparse) for sparse in (False, True)]
         self.states = SwarmState(tables[0]), SwarmState(tables[1], joint=SparseFilter(tables[1]))
-        self.poses = np.column_stack(
-            [self.rng.uniform(0.0, 5.0, (robots, 2)), self.rng.uniform(-3.0, 3.0, robots)]
-        )
+        drawn = self.rng.uniform(0.0, 5.0, (robots, 2)) if places is None else places
+        self.poses = np.column_stack([drawn, self.rng.uniform(-3.0, 3.0, robots)])
         self.now_ns = 0
         self.covariance, self.jacobian = np.zeros((robots, 3, 3)), np.zeros((robots, 3, DRIVES))
         for robot in range(robots):
@@ -271,7 +210,8 @@ class BothParameters:
                         used[k, place], jacobian[k, :, place] = estimated, chains[k, :, place - 3]
             noise = np.tile(NOISE, (len(pairs), 1, 1))
             corrections.append(state.filter.update(used, jacobian, innovation, noise))
-        return self.in_dense(corrections[1]) - corrections[0], np.concatenate(gaps)
+        self.exact = corrections[0]
+        return self.in_dense(corrections[1]) - self.exact, np.concatenate(gaps)
 
     def columns(self) -> tuple[IntArray, IntArray]:
         """Columns (n,) of the same in either filter, of all that is estimated."""
@@ -312,7 +252,21 @@ class BothParameters:
             np.testing.assert_allclose(nearly / scale, exact / scale, atol=tolerance)
 
 
-def step_of_all(both: BothParameters, step: int) -> tuple[FloatArray, FloatArray]:
+def test_many_fronts_are_nearly_exact() -> None:
+    """Of a hundred robots, each of which measures those beside it, and one an exact landmark."""
+    both = Both(100, 0, (Robot(""),), grid(100))
+    pairs = np.concatenate([neighbours(grid(100)), [[0, 102]]])
+    for _ in range(60):
+        both.drive()
+        correction, _ = both.update(pairs[both.rng.uniform(size=len(pairs)) < 0.4])
+    columns = 3 * np.arange(100)[:, None] + np.arange(3)
+    exact, nearly = (np.array([state.filter.block(one) for one in columns]) for state in both.states)
+    ratio = np.trace(nearly, axis1=1, axis2=2) / np.trace(exact, axis1=1, axis2=2)
+    assert 0.9 < ratio.min() < ratio.max() < 1.1
+    assert np.linalg.norm(correction) < 0.1 * np.linalg.norm(both.exact)
+
+
+def step_of_all(both: Both, step: int) -> tuple[FloatArray, FloatArray]:
     """A step in which all see all; in some steps robots leave, join or are contradicted."""
     both.drive()
     if step in (8, 20):
@@ -333,7 +287,7 @@ def step_of_all(both: BothParameters, step: int) -> tuple[FloatArray, FloatArray
 @pytest.mark.parametrize("kind", [*KINDS[:4], KINDS[-1]])
 def test_with_one_calibrated_robot_it_is_exact(kind: Robot, seed: int) -> None:
     """The pattern is full: that robot's parameters depend on nothing but poses in it."""
-    both = BothParameters(6, seed, (kind, *5 * [Robot("")]))
+    both = Both(6, seed, (kind, *5 * [Robot("")]))
     for step in range(30):
         correction, cross_covariance = step_of_all(both, step)
         np.testing.assert_allclose(correction, 0.0, atol=1e-12)
@@ -344,7 +298,7 @@ def test_with_one_calibrated_robot_it_is_exact(kind: Robot, seed: int) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_with_many_calibrated_robots_it_is_nearly_exact(seed: int) -> None:
     """That parameters of two robots depend on each other, given all poses, is left out."""
-    both = BothParameters(6, seed)
+    both = Both(6, seed)
     for step in range(30):
         correction, _ = step_of_all(both, step)
         sigma = np.sqrt(np.diag(both.states[0].filter.covariance))
@@ -354,7 +308,7 @@ def test_with_many_calibrated_robots_it_is_nearly_exact(seed: int) -> None:
 
 def test_before_the_first_update_moves_are_exact() -> None:
     """What robots' parameters have moved is in the covariances of all pairs that are measured."""
-    both = BothParameters(6, 1)
+    both = Both(6, 1)
     for _ in range(2):
         both.drive()
         _, cross_covariance = both.update(np.array(list(itertools.permutations(range(6), 2))))
@@ -364,16 +318,9 @@ def test_before_the_first_update_moves_are_exact() -> None:
 COUNT = 60
 
 
-def grid_parts() -> FloatArray:
-    index = np.arange(COUNT)
-    return 0.5 * np.column_stack([index % 8, index // 8]).astype(float)
-
-
 def situation(pairs: list[tuple[int, int]]) -> Situation:
     no_blocks = Order(np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64))
-    return Situation(
-        np.arange(COUNT), no_blocks, grid_parts(), np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    )
+    return Situation(np.arange(COUNT), no_blocks, grid(COUNT), np.array(pairs, dtype=np.int64).reshape(-1, 2))
 
 
 PAIR = st.tuples(st.integers(0, COUNT - 1), st.integers(0, COUNT - 1))

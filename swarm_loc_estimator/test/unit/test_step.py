@@ -29,6 +29,9 @@ SECOND = 10**9
 T = np.arange(0.0, 5.0, 0.1)
 DRIVEN: dict[str, Any] = {"robot": "r1", "stamp_s": T, "pose": np.column_stack([0.1 * T, 0.0 * T, 0.0 * T])}
 SWARM = Swarm((Robot("r1", start=(0.0, 0.0, 0.0)),))
+SEEN = {"robot": 0, "stamp_s": T, "id": 7}
+RANGED = {"robot": 0, "stamp_s": T, "range": 1.0}
+NO_WHOLE_NUMBERS = "ranges: device must be whole numbers that fit into"
 
 
 def recorded(until_s: float) -> tuple[Swarm, list[Batch], int]:
@@ -126,23 +129,18 @@ def test_late_readings_count_up_to_the_horizon_and_what_was_dropped_is_returned(
             "odometry: no column 'speed'; columns are robot, stamp_ns, pose",
         ),
         ({"odometry": T}, "odometry must be columns by name, not"),
-        ({"detections": {"robot": 0, "stamp_s": T, "id": 7}}, "detections: the column 'position' is missing"),
+        ({"detections": SEEN}, "detections: the column 'position' is missing"),
         (
-            {"detections": {"robot": 0, "stamp_s": T, "id": 7, "position": np.zeros((50, 2))}},
+            {"detections": SEEN | {"position": np.zeros((50, 2))}},
             r"detections: position has shape \(50, 2\), not \(50, 3\)",
         ),
-        *(
-            (
-                {"ranges": {"robot": 0, "stamp_s": T, "range": 1.0, "device": device}},
-                f"ranges: device {wrong}",
-            )
-            for device, wrong in [
-                (7.6, "must be whole numbers that fit into"),
-                (np.nan, "has wrong values: cannot convert float NaN"),
-                (np.full(50, -7), "must be whole numbers that fit into"),
-                (-1, "has wrong values: Python integer"),
-            ]
+        ({"ranges": RANGED | {"device": 7.6}}, NO_WHOLE_NUMBERS),
+        ({"ranges": RANGED | {"device": np.full(50, -7)}}, NO_WHOLE_NUMBERS),
+        (
+            {"ranges": RANGED | {"device": np.nan}},
+            "ranges: device has wrong values: cannot convert float NaN",
         ),
+        ({"ranges": RANGED | {"device": -1}}, "ranges: device has wrong values: Python integer"),
         ({"now_ns": 5 * SECOND}, "step needs either now_s or now_ns"),
         ({"now_s": np.nan}, "now_s must be finite, not nan"),
         ({"now_s": None}, "step needs either now_s or now_ns"),

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from core_messages import detection, joined
-from core_messages import joined as joined_detections
 from core_run import covariance_of_places, recording_of
 from core_world import Plan, World, simulate
 from scipy.spatial.transform import Rotation
@@ -370,9 +369,19 @@ def located_start(world: World) -> Swarm:
     return replace(world.swarm, robots=(first, *world.swarm.robots[1:]), landmarks=())
 
 
+def axes_of(camera: FixedCamera) -> FloatArray:
+    matrix: FloatArray = Rotation.from_euler("ZYX", [camera.yaw, camera.pitch, camera.roll]).as_matrix()
+    return matrix
+
+
+def with_radios(swarm: Swarm) -> Swarm:
+    robots = [replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(swarm.robots, 1)]
+    return replace(swarm, robots=tuple(robots))
+
+
 def seen_from_above(world: World, rng: np.random.Generator, wrong: float = 0.0) -> DetectionRows:
     """What the camera at the ceiling sees: directions are good, distances are not."""
-    turn = Rotation.from_euler("ZYX", [CEILING.yaw, CEILING.pitch, CEILING.roll]).as_matrix() @ FROM_OPTICAL
+    turn = axes_of(CEILING) @ FROM_OPTICAL
     rows, robots = [], len(world.swarm.robots)
     for k in range(0, world.stamp_ns.size, 4):
         for robot, pose in zip(world.swarm.robots, world.truth[k], strict=True):
@@ -386,9 +395,7 @@ def seen_from_above(world: World, rng: np.random.Generator, wrong: float = 0.0) 
             one["position"] = optical * (1.05 + 0.02 * rng.standard_normal())
             rows.append((world.stamp_ns[k], one))
     at_ns = np.array([at for at, _ in rows])
-    return DetectionRows(
-        np.full(at_ns.size, robots), at_ns, joined_detections([one for _, one in rows]), at_ns
-    )
+    return DetectionRows(np.full(at_ns.size, robots), at_ns, joined([one for _, one in rows]), at_ns)
 
 
 def measured_ranges(world: World, rng: np.random.Generator, wrong: float = 0.0) -> RangeRows:
@@ -418,10 +425,7 @@ def test_a_fixed_camera_is_placed_by_the_robots_that_it_sees(seed: int, wrong: f
     (found,) = survey(recording, swarm, cameras=True).swarm.cameras
     assert np.hypot(found.x - CEILING.x, found.y - CEILING.y) < 0.06
     assert abs(found.z - CEILING.z) < 0.06
-    axes = [
-        Rotation.from_euler("ZYX", [one.yaw, one.pitch, one.roll]).as_matrix() for one in (found, CEILING)
-    ]
-    assert Rotation.from_matrix(axes[0] @ axes[1].T).magnitude() < 0.03
+    assert Rotation.from_matrix(axes_of(found) @ axes_of(CEILING).T).magnitude() < 0.03
     assert 1e-4 <= found.position_sigma < 0.02
     assert seed or wrong or survey(recording, swarm).swarm.cameras == (stale,)
 
@@ -432,15 +436,14 @@ def test_anchors_are_placed_by_their_ranges(seed: int, wrong: float) -> None:
     world = simulate(replace(PLAN, duration_s=40.0), seed)
     ranges = measured_ranges(world, np.random.default_rng(seed), wrong)
     recording = replace(recording_of(world), ranges=ranges)
-    swarm = located_start(world)
-    robots = tuple(replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(swarm.robots, 1))
-    done = survey(recording, replace(swarm, robots=robots))
+    swarm = with_radios(located_start(world))
+    done = survey(recording, swarm)
     assert [one.address for one in done.swarm.anchors] == [0xA1, 0xA2]
     for one, true in zip(done.swarm.anchors, ANCHORS, strict=True):
         error = np.hypot(one.x - true.x, one.y - true.y)
         assert error < min(0.15, 5.0 * one.position_sigma + 0.02)
     assert "0xa1" in done.text
-    known = replace(swarm, robots=robots, anchors=ANCHORS[:1])
+    known = replace(swarm, anchors=ANCHORS[:1])
     assert seed or wrong or survey(recording, known).swarm.anchors[0] == ANCHORS[0]
 
 
@@ -448,10 +451,7 @@ def test_what_was_measured_rarely_is_named() -> None:
     world = simulate(PLAN, 0)
     ranges = measured_ranges(world, np.random.default_rng(0))
     recording = replace(recording_of(world), ranges=select(ranges, np.arange(40)))
-    robots = tuple(
-        replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(world.swarm.robots, 1)
-    )
-    swarm = replace(world.swarm, robots=robots, landmarks=(), cameras=(CEILING,))
+    swarm = replace(with_radios(world.swarm), landmarks=(), cameras=(CEILING,))
     done = survey(recording, swarm, cameras=True)
     assert "Anchor 0xa1 was measured 20 x only and is left out; drive near it." in done.text
     assert (
@@ -488,8 +488,7 @@ def placed(
         return found
 
     top = np.column_stack([true, np.full(COUNT, 0.08)])
-    turn = Rotation.from_euler("ZYX", [camera.yaw, camera.pitch, camera.roll]).as_matrix() @ FROM_OPTICAL
-    optical = (top - [camera.x, camera.y, camera.z]) @ turn
+    optical = (top - [camera.x, camera.y, camera.z]) @ axes_of(camera) @ FROM_OPTICAL
     optical[:, :2] += 0.002 * optical[:, 2:] * rng.standard_normal((COUNT, 2))
     seen = joined([detection(face.id, np.eye(4)) for _ in range(COUNT)])
     seen["position"] = optical

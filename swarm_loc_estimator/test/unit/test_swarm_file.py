@@ -69,10 +69,19 @@ landmarks:
 RELAXED = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
+WHEELS = "types.epuck.odometry.wheel_separation"
+A_MARKER_ID = "a marker id, a whole number in [0, 4294967295]"
+
+
 def load(folder: Path, text: str | bytes) -> Swarm:
     path = folder / "swarm.yaml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return load_swarm(path)
+
+
+def read_back(folder: Path, swarm: Swarm) -> Swarm:
+    save_swarm(swarm, folder / "again.yaml", "a comment\nof two lines")
+    return load_swarm(folder / "again.yaml")
 
 
 def error_of(folder: Path, text: str | bytes) -> str:
@@ -131,19 +140,11 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("on: 0.053", "on: -1", "types.epuck.odometry.wheel_separation is -1 but must lie in [0.001, 10] m."),
-        (": 0.053", ": .nan", "types.epuck.odometry.wheel_separation is nan but must lie in [0.001, 10] m."),
-        (" 0.053", " -.inf", "types.epuck.odometry.wheel_separation is -inf but must lie in [0.001, 10] m."),
-        (
-            "wheel_separation: 0.053",
-            "wheel_separation: true",
-            "types.epuck.odometry.wheel_separation is True but must be a number in [0.001, 10] m.",
-        ),
-        (
-            "wheel_separation: 0.053",
-            "wheel_separation: '1'",
-            "types.epuck.odometry.wheel_separation is '1' but must be a number in [0.001, 10] m.",
-        ),
+        (" 0.053", " -1", f"{WHEELS} is -1 but must lie in [0.001, 10] m."),
+        (" 0.053", " .nan", f"{WHEELS} is nan but must lie in [0.001, 10] m."),
+        (" 0.053", " -.inf", f"{WHEELS} is -inf but must lie in [0.001, 10] m."),
+        (" 0.053", " true", f"{WHEELS} is True but must be a number in [0.001, 10] m."),
+        (" 0.053", " '1'", f"{WHEELS} is '1' but must be a number in [0.001, 10] m."),
         ("range_sigma: 0.2", "range_sigma: 0", "defaults.sensor.range_sigma is 0 but must lie in (0, 10] m."),
         (
             "wheel_separation: 0.053",
@@ -172,19 +173,15 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
             "front: 100",
             "marker id 100 belongs to both face 'front' of robot 'two' and landmark 100; ids must be unique.",
         ),
-        (
-            "front: 3",
-            "front: 3.5",
-            "robots.two.ids.front is 3.5 but must be a marker id, a whole number in [0, 4294967295].",
-        ),
+        ("front: 3", "front: 3.5", f"robots.two.ids.front is 3.5 but must be {A_MARKER_ID}."),
         ("front: 3", "frnt: 3", "'robots.two.ids.frnt' is not a known key; the nearest one is 'front'."),
         ("1, back: 2", "1", "robots.one.ids has no id for face 'back'; give one or set faces.back to null."),
-        ("101", "abc", "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295]."),
+        ("101", "abc", f"landmarks.abc is 'abc' but must be {A_MARKER_ID}."),
         ("  101: {x: 0, y: 0", "  100: {x: 0, y: 0", "'100' is given twice, again in line 30."),
         ("position_sigma", "x", "'defaults.landmark.x' is not a known key; the nearest one is 'yaw_sigma'."),
         (
-            "{position_sigma: 0.02}",
-            "{yaw_sigma: -1}",
+            "position_sigma: 0.02",
+            "yaw_sigma: -1",
             "defaults.landmark.yaw_sigma is -1 but must lie in [0, 10] rad.",
         ),
         ("size: 0.08", "size: 0.0", "landmarks.100.size is 0.0 but must lie in [0.001, 10] m."),
@@ -205,13 +202,11 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
     ],
 )
 def test_one_sentence_names_key_value_and_range(tmp_path: Path, old: str, new: str, sentence: str) -> None:
-    assert old in EXAMPLE
     assert error_of(tmp_path, EXAMPLE.replace(old, new, 1)) == sentence
 
 
 @pytest.mark.parametrize("name", ["map", "swarm", "aerial", "estimator", "tf"])
 def test_names_that_topics_and_frames_have_are_refused(tmp_path: Path, name: str) -> None:
-    assert "\n  four:" in EXAMPLE
     said = error_of(tmp_path, EXAMPLE.replace("\n  four:", f"\n  {name}:"))
     assert said.startswith(f"a name in robots is '{name}' but must be none of aerial, clock,")
 
@@ -247,6 +242,7 @@ def test_names_that_topics_and_frames_have_are_refused(tmp_path: Path, name: str
         ("fileversion: !!timestamp 2000-01-01", "tag"),
         ("fileversion: 1\n!!merge <<: {}", "tag"),
     ],
+    ids=lambda one: repr(one)[:40],
 )
 def test_files_that_are_no_description(tmp_path: Path, text: str | bytes, part: str) -> None:
     assert part in error_of(tmp_path, text)
@@ -313,8 +309,7 @@ def test_fixed_cameras_and_lying_faces_are_read_and_written(tmp_path: Path) -> N
     assert swarm.cameras == (up, FixedCamera("wall", 0.0, 2.0, 1.0, 0.0, 0.6, 0.1, 0.004, 0.01))
     assert swarm.robots[0].faces == (Face("top", 4, z=0.1, yaw=0.5, lies=True), Face("side", 5, yaw=0.0))
     assert swarm.robots[1].faces == (Face("top", 6, z=0.1, yaw=0.5),)
-    save_swarm(swarm, tmp_path / "again.yaml")
-    assert load_swarm(tmp_path / "again.yaml") == swarm
+    assert read_back(tmp_path, swarm) == swarm
 
 
 @pytest.mark.parametrize(
@@ -339,6 +334,7 @@ def test_a_wrong_camera_is_named_in_one_sentence(old: str, new: str, said: str, 
     assert said in error_of(tmp_path, EXAMPLE_CAMERAS.replace(old, new, 1))
 
 
+A_PLATFORM = "the name of a packaged one or the path of a file"
 PACKAGED_DROPLET = Path(ir_board.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
 IR = """\
 fileversion: 1
@@ -381,8 +377,7 @@ def test_infrared_boards_are_written_and_read_back_also_elsewhere(tmp_path: Path
     swarm = load_ir(tmp_path, IR)
     for folder in (tmp_path, tmp_path / "deeper"):
         folder.mkdir(exist_ok=True)
-        save_swarm(swarm, folder / "again.yaml")
-        assert load_swarm(folder / "again.yaml") == swarm
+        assert read_back(folder, swarm) == swarm
     assert "platform: ../board.yaml" in (tmp_path / "deeper" / "again.yaml").read_text()
 
 
@@ -394,21 +389,13 @@ def test_infrared_boards_are_written_and_read_back_also_elsewhere(tmp_path: Path
         ("0xDF64", "true", "robots.one.ir.id is True but must be a whole number in [1, 65535]."),
         ("0xDF64", "7", "ir.id 7 belongs to both robot 'one' and robot 'two'; ids must be unique."),
         (": droplet, ir: {id: 0xDF64}", ": droplet", "robots.one.ir lacks id, a whole number in [1, 65535]."),
-        (
-            "platform: droplet, ",
-            "",
-            "robots.one.ir lacks platform, the name of a packaged one or the path of a file.",
-        ),
-        (
-            "platform: droplet, ",
-            "id: 3, ",
-            "'types.droplet.ir.id' is not a known key; the nearest one is 'gains'.",
-        ),
+        ("platform: droplet, ", "", f"robots.one.ir lacks platform, {A_PLATFORM}."),
         (
             "platform: droplet",
-            "platform: 5",
-            "types.droplet.ir.platform is 5 but must be the name of a packaged one or the path of a file.",
+            "id: 3",
+            "'types.droplet.ir.id' is not a known key; the nearest one is 'gains'.",
         ),
+        ("platform: droplet", "platform: 5", f"types.droplet.ir.platform is 5 but must be {A_PLATFORM}."),
         (
             "id: 7",
             "id: 7, estimator: closed_form",
@@ -431,7 +418,6 @@ def test_infrared_boards_are_written_and_read_back_also_elsewhere(tmp_path: Path
 def test_one_sentence_says_what_is_wrong_with_a_board(
     tmp_path: Path, old: str, new: str, sentence: str
 ) -> None:
-    assert old in IR
     (tmp_path / "board.yaml").write_text(PACKAGED_DROPLET.read_text())
     assert error_of(tmp_path, IR.replace(old, new, 1)) == sentence
 
@@ -463,15 +449,14 @@ anchors:
 
 
 def test_a_description_is_read_and_written_back(tmp_path: Path) -> None:
-    path, swarm = tmp_path / "swarm.yaml", load(tmp_path, DESCRIPTION)
+    swarm = load(tmp_path, DESCRIPTION)
     assert [robot.uwb for robot in swarm.robots] == [
         UwbDevice(31, 0.1, 0.0, 0.4, 0.05, range_bias=-0.02),
         UwbDevice(HUGE, 0.1, 0.0, 0.4, 0.05),
         None,
     ]
     assert swarm.anchors == (Anchor(7, 0.0, 5.0, 2.5), Anchor(16, 5.0, 5.0, position_sigma=0.05))
-    save_swarm(swarm, path)
-    assert load_swarm(path) == swarm
+    assert read_back(tmp_path, swarm) == swarm
 
 
 @pytest.mark.parametrize(
@@ -616,8 +601,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
 @RELAXED
 @given(swarm=swarms())
 def test_what_is_written_is_read_back(tmp_path: Path, swarm: Swarm) -> None:
-    save_swarm(swarm, tmp_path / "swarm.yaml", "a comment\nof two lines")
-    assert load_swarm(tmp_path / "swarm.yaml") == swarm
+    assert read_back(tmp_path, swarm) == swarm
 
 
 def test_written_file_says_shared_things_once(tmp_path: Path) -> None:

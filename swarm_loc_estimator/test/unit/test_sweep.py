@@ -134,52 +134,42 @@ def test_a_job_is_another_when_anything_changes_that_determines_its_result(folde
         ("bags: short", "bags is 'short' but must be a list"),
         ("bags: [shirt]", "bags[0] is 'shirt' but must be a bag or a pattern of bags"),
         ("bags: [short, 'x*']", "bags[1] is 'x*' but must be a bag or a pattern of bags"),
-        ("bags: [short]\nseed: [1]", "'seed' is not a known key; the nearest one is 'seeds'"),
+        ("seed: [1]", "'seed' is not a known key; the nearest one is 'seeds'"),
+        ("settings: {horizon: [1]}", "'settings.horizon' is not a known key; the nearest one is"),
+        ("settings: {horizon_s: 1}", "settings.horizon_s is 1 but must be a list"),
+        ("settings: {horizon_s: [1, 99]}", "parameter settings.horizon_s[1] = 99.0 must lie in [0.05, 60] s"),
+        ("lost: [0, 1]", "parameter lost[1] = 1.0 must lie in [0, 0.99]"),
+        ("fit: {trials: 9}", "fit lacks ranges"),
+        ("fit: {trials: 9, ranges: {}}", "must name at least one setting"),
+        ("fit: {trials: 1, ranges: {horizon_s: [1, 2]}}", "must lie in [2, 10000]"),
         (
-            "bags: [short]\nsettings: {horizon: [1]}",
-            "'settings.horizon' is not a known key; the nearest one is",
-        ),
-        ("bags: [short]\nsettings: {horizon_s: 1}", "settings.horizon_s is 1 but must be a list"),
-        (
-            "bags: [short]\nsettings: {horizon_s: [1, 99]}",
-            "parameter settings.horizon_s[1] = 99.0 must lie in [0.05, 60] s",
-        ),
-        ("bags: [short]\nlost: [0, 1]", "parameter lost[1] = 1.0 must lie in [0, 0.99]"),
-        ("bags: [short]\nfit: {trials: 9}", "fit lacks ranges"),
-        ("bags: [short]\nfit: {trials: 9, ranges: {}}", "must name at least one setting"),
-        ("bags: [short]\nfit: {trials: 1, ranges: {horizon_s: [1, 2]}}", "must lie in [2, 10000]"),
-        (
-            "bags: [short]\nfit: {trials: 9, ranges: {horizon_s: [2, 1]}}",
+            "fit: {trials: 9, ranges: {horizon_s: [2, 1]}}",
             "fit.ranges.horizon_s is [2, 1] but must be its least and its greatest value",
         ),
         (
-            "bags: [short]\nfit: {trials: 9, ranges: {horizon_s: [1, 99]}}",
+            "fit: {trials: 9, ranges: {horizon_s: [1, 99]}}",
             "parameter fit.ranges.horizon_s = 99.0 must lie in [0.05, 60] s",
         ),
         (
-            "bags: [short]\nsettings: {horizon_s: [1]}\nfit: {trials: 9, ranges: {horizon_s: [1, 2]}}",
+            "settings: {horizon_s: [1]}\nfit: {trials: 9, ranges: {horizon_s: [1, 2]}}",
             "must be of a number that is not in settings, too",
         ),
         (
-            "bags: [short]\nfit: {minimize: nees, trials: 9, ranges: {horizon_s: [1, 2]}}",
+            "fit: {minimize: nees, trials: 9, ranges: {horizon_s: [1, 2]}}",
             "fit.minimize is 'nees' but must be one of position_rmse_m,",
         ),
-        ("bags: [short]\nlost: [0.1, 0.1]", "lost is [0.1, 0.1] but must be a list of at least one value"),
-        (
-            "bags: [short]\nsettings: {horizon_s: [1, 1.0]}",
-            "settings.horizon_s is [1, 1.0] but must be a list",
-        ),
-        ("bags: [short]\nlost: [0.1]\nseeds: [0.5]", "parameter seeds[0] = 0.5 must be a whole number"),
-        (
-            "bags: [short]\nseeds: [1]",
-            "seeds choose which messages are lost, but lost names no share above 0",
-        ),
-        ("bags: [short]\nworkers: 0", "parameter workers = 0 must lie in [1, 4096]"),
+        ("lost: [0.1, 0.1]", "lost is [0.1, 0.1] but must be a list of at least one value"),
+        ("settings: {horizon_s: [1, 1.0]}", "settings.horizon_s is [1, 1.0] but must be a list"),
+        ("lost: [0.1]\nseeds: [0.5]", "parameter seeds[0] = 0.5 must be a whole number"),
+        ("seeds: [1]", "seeds choose which messages are lost, but lost names no share above 0"),
+        ("workers: 0", "parameter workers = 0 must lie in [1, 4096]"),
     ],
 )
 def test_what_cannot_be_run_is_one_sentence(
     folder: Path, text: str, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    if text and "bags" not in text:
+        text = f"bags: [short]\n{text}"
     assert run(written(folder, text)) == 1
     error = capsys.readouterr().err
     assert said in error

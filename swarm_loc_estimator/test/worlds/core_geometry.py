@@ -1,6 +1,7 @@
 """Frames, poses and their errors for the tests of the core, written independently of the code under test."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +56,15 @@ def planar(pose: FloatArray) -> FloatArray:
 def pose_of(matrix: FloatArray) -> FloatArray:
     """The pose (3,) of a homogeneous matrix (3, 3)."""
     return np.array([matrix[0, 2], matrix[1, 2], math.atan2(matrix[1, 0], matrix[0, 0])])
+
+
+def slopes_of(function: Callable[[FloatArray], ArrayLike], size: int, step: ArrayLike = 1e-6) -> FloatArray:
+    """Central differences (..., size) of a function of changes (size,), by one step or one of each."""
+    steps = np.broadcast_to(np.asarray(step, dtype=float), (size,))
+    sides = [(function(change), function(-change)) for change in np.diag(steps)]
+    differences = [np.subtract(*ends) / (2.0 * one) for ends, one in zip(sides, steps, strict=True)]
+    slopes: FloatArray = np.stack(differences, axis=-1)
+    return slopes
 
 
 def wrapped(error: FloatArray) -> FloatArray:

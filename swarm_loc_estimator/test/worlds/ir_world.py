@@ -90,12 +90,6 @@ def pose_errors(found: FloatArray, poses: FloatArray) -> FloatArray:
     return errors
 
 
-def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
-    """(k,) normalised errors squared."""
-    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    return np.asarray(np.sum(errors * solved, axis=-1))
-
-
 def pair_of(
     model: IrModel,
     readings: FloatArray,

@@ -14,12 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
-from swarm_loc_vision.aerial.ground_control import (
-    ControlPoints,
-    Ground,
-    GroundFileError,
-    save_ground,
-)
+from swarm_loc_vision.aerial.ground_control import ControlPoints, Ground, GroundFileError, save_ground
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 

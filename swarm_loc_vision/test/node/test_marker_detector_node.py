@@ -176,9 +176,7 @@ def test_markers_that_fit_no_square_are_told(ros: Ros) -> None:
     assert camera.status().level == DiagnosticStatus.WARN
     assert int(camera.values()["markers that fit no square"]) > 0
     camera.calibrate(camera_info(), "detecting")
-    ros.publish_until(
-        camera.images, image(2), lambda: any(d.header.stamp.sec == 2 for d in camera.detections)
-    )
+    camera.see(image(2))
     ros.until(lambda: camera.status().message == "detecting")
 
 
