@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.shared.common import options_of, rms, table, write_figures
+from bench.shared.common import SHARED, options_of, rms, table, write_figures
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import (
@@ -36,7 +36,7 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
-_DATA = Path("/work/shared/data")
+_DATA = SHARED / "data"
 _PATTERN = "uwb/tof/{from}/{to}/distance"
 _TWO = {
     "turtle01": (2, "/vrpn_client_node/turtlebot01_cap/pose"),

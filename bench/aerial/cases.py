@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.aerial.detector import Score, score_places
-from bench.shared.common import Cell, rms, table
+from bench.shared.common import SHARED, Cell, rms, table
 from swarm_loc_vision.aerial.detector import AerialDetector
 from swarm_loc_vision.aerial.ground_control import AerialSettings, load_ground, solve_pose
 
-FOLDER = Path(__file__).parents[3] / "shared" / "cases"
+FOLDER = SHARED / "cases"
 _DIAMETER = 0.08
 _KILOBOT = 0.033  # Diameter and height of a Kilobot [m]
 _FLAT_HEIGHT = 0.03  # Height of the tops of robots without visible sides, by their parallax [m]

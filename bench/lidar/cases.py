@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
+from bench.shared.common import SHARED
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
-FOLDER = Path("/work/shared/cases/replay")
+FOLDER = SHARED / "cases" / "replay"
 _TRACKED, _ERROR_M, _MISLEADING = 0.85, 0.05, 0.001
 """Least share of tracked poses, greatest RMSE, and greatest share of misleading ones where all is right."""
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.bags import message_header
+from bench.shared.common import SHARED
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY, encode
@@ -17,7 +18,7 @@ from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
-RADISH = Path("/work/shared/data/radish")  # Its README says what the files mean
+RADISH = SHARED / "data" / "radish"  # Its README says what the files mean
 BUILDINGS = ("freiburg-101", "acapulco", "intel", "freiburg-079")
 NAME = "robot"
 _FARTHEST = 50.0  # Range from which nothing was met, in all of them [m]

@@ -6,11 +6,10 @@ are published. A robot at a wrong place leaves residuals of several decimetres.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import scipy
 
+from bench.shared.common import SHARED
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
@@ -24,7 +23,7 @@ from swarm_loc_estimator.swarm.error_models import LidarModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
-FOLDER = Path("/work/shared/data/turtlebot4_map")
+FOLDER = SHARED / "data" / "turtlebot4_map"
 MAP = FOLDER / "mac_1st_floor_final.yaml"
 _REMAP = {"tb4/odom": "/odom", "tb4/scan": "/scan"}
 _TICK_S, _LATE_S, _MOUNT = 0.05, 0.175, (0.004, 0.0, 0.5 * np.pi)

@@ -27,11 +27,11 @@ from typing import Any
 from bench.mrclam.jobs import MODELS, Results, bag_of, collected, fit, jobs_of, prepare, run, speed_factor
 from bench.mrclam.report import report
 from bench.mrclam.sets import NoSetsError, find_sets
-from bench.shared.common import OUT
+from bench.shared.common import SHARED
 from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
-DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "mrclam"
+DEFAULT_FOLDER = SHARED / "data" / "mrclam"
 _PROCESSES = 2
 
 

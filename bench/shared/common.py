@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 OUT = Path(__file__).resolve().parents[2] / "out"  # Folder of results
+SHARED = OUT.parents[1] / "shared"  # Recordings of others, next to the workspace
 DEMO_BAG = OUT.parent / "bags" / "eight_five_robots"
 
 _STYLE = {

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.aerial.cases import FOLDER, gray_picture
-from bench.shared.common import Cell, table
+from bench.aerial.cases import gray_picture
+from bench.shared.common import SHARED, Cell, table
 from bench.vision.comparison import LOOKS, MARKERS, match
 from bench.vision.peers import as_found, own_detector
 from bench.vision.scenes import Gray, random_scene
@@ -24,7 +24,7 @@ from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import family_named
 
-PHOTOS = FOLDER.parent / "data" / "photos"
+PHOTOS = SHARED / "data" / "photos"
 _BOUND_99 = 16.8  # Of chi square with six degrees of freedom
 _MIN_CORNERS = 8  # Of a board, in a picture that is used
 
