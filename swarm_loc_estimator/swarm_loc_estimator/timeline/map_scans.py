@@ -451,7 +451,7 @@ class MapScans:
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # With a second solution it locates no robot alone: it was sought near the pose that may be wrong.
         fix.has_second[:], fix.second[:] = True, fix.value
-        tells = follows if is_doubted else found.determined == ALL
+        tells = (follows and found.determined >= ALL - 1) if is_doubted else found.determined == ALL
         return fix, Verdict.OPEN, tells and found.fitting >= SURE_FIT
 
     def _left_out(

@@ -236,35 +236,35 @@ class MapSearch:
             reported: (3,) pose by a motion that odometry has left out, if it has.
             least: Share of the beams that must fit.
         """
-        # places around the prediction, and around what odometry reports
+        # places around the prediction and around what odometry reports, and farther away
         beams = SweptBeams.thinned(ends, origin, variance)
         points = _spread(beams.ends)
-        sigma = np.clip(np.sqrt(np.diag(covariance)), *_AROUND)
-        if reported is not None:  # what is left out may be the whole turn
-            sigma = _AROUND[0]
-        centres = [one for one in (predicted, reported) if one is not None]
-        poses = (np.array(centres)[:, None] + _OFFSETS * sigma).reshape(-1, 3)
-        score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
-        order = _largest(score, len(score))
-        kept = order[_separate(poses[order], score[order], _NEAR_BY)]
+        left_out = reported is not None  # maybe the whole turn
+        sigma = _AROUND[0] if left_out else np.clip(np.sqrt(np.diag(covariance)), *_AROUND)
+        centres = np.array([one for one in (predicted, reported) if one is not None])
+        matched = []
+        for step in (sigma, _AROUND[1]):
+            poses = (centres[:, None] + _OFFSETS * step).reshape(-1, 3)
+            score = _scores(known, points, poses, 0.75 * step[0]) if len(points) else np.zeros(len(poses))
+            order = _largest(score, len(score))
+            near_by = poses[order[_separate(poses[order], score[order], _NEAR_BY)]]
+            found = [match(known.walls, *beams, pose, np.diag(step**2)) for pose in near_by]
+            matched.append(sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True))
         # the one that explains the scan, if no other does
-        found = [match(known.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
-        found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
-        if not found or found[0].fitting < least:
+        if not matched[0] or matched[0][0].fitting < least:
             return None
-        best, rival = found[0], 0.0
-        for other in found[1:]:
+        best, rivals = matched[0][0], [0.0, 0.0]
+        for k, other in [(n, one) for n in (0, 1) for one in matched[n]]:
             square = squared_distance(best.pose, other.pose, best.covariance + other.covariance + _SAME)
-            rival = max(rival, other.fitting) if square > _RIVAL else rival
-        if rival > best.fitting - DECLINE:
+            rivals[k] = max(rivals[k], other.fitting if square > _RIVAL else 0.0)
+        if rivals[0] > best.fitting - DECLINE:
             return None
         # walls may not tell all: it may be anywhere between the centres
         way = (centres[-1] - predicted) * [1.0, 1.0, 0.0]
-        around = np.diag(sigma**2) + np.outer(way, way)
-        information = np.linalg.inv(best.covariance) + np.linalg.inv(around)
+        around = np.linalg.inv(np.diag(sigma**2) + np.outer(way, way))
+        covariance = np.linalg.inv(np.linalg.inv(best.covariance) + around)
         is_clear = best.fitting >= _CLEAR_FIT and best.through <= _CLEAR_THROUGH and best.determined == ALL
-        is_certain = is_clear and best.fitting - rival > _CLEAR_LEAD
-        return FoundPlace(best.pose, np.linalg.inv(information), is_certain)
+        return FoundPlace(best.pose, covariance, is_clear and best.fitting - max(rivals) > _CLEAR_LEAD)
 
     def _add(
         self,
