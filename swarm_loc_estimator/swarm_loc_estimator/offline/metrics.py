@@ -81,7 +81,10 @@ def compare(
     known &= np.isfinite(estimate.pose).all(axis=1)
     index = np.flatnonzero(known)
     stamp_ns, found, wanted = estimate.stamp_ns[index], estimate.pose[index], truth_there[index]
-    alone = truth.stamp_ns[_alone(truth.stamp_ns, max_gap_ns)]
+    # truth that is farther than the gap from both neighbours
+    far = np.diff(truth.stamp_ns) > max_gap_ns
+    is_alone = np.concatenate([[True], far]) & np.concatenate([far, [True]])
+    alone = truth.stamp_ns[is_alone[: len(truth.stamp_ns)]]
     alone = alone[~np.isin(alone, stamp_ns)]
     at_alone, reached = interpolate(estimate, alone, max_gap_ns)
     reached &= np.isfinite(at_alone).all(axis=1)
@@ -147,14 +150,6 @@ def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
     rmse = float(np.sqrt(np.mean(values * values)))
     median, p95 = (float(figure) for figure in np.percentile(values, [50, 95]))
     return rmse, float(values.mean()), median, p95, float(values.max())
-
-
-def _alone(stamp_ns: IntArray, max_gap_ns: int) -> BoolArray:
-    """(N,) whether a stamp is further than the gap from both neighbours."""
-    far = np.diff(stamp_ns) > max_gap_ns
-    ends = np.ones(1, np.bool_)
-    lonely: BoolArray = np.concatenate([ends, far]) & np.concatenate([far, ends])
-    return lonely[: len(stamp_ns)]
 
 
 def _nearest(stamp_ns: IntArray, query_ns: IntArray) -> npt.NDArray[np.intp]:

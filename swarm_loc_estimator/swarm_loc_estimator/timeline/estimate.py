@@ -38,7 +38,7 @@ class Status(IntEnum):
     WAITING = 0  # not localized
     TRACKED = 1
     STALE = 2  # localized, but its odometry has timed out
-    UNCONFIRMED = 3  # initialized, but not confirmed by a later measurement yet
+    UNCONFIRMED = 3  # localized, but no later measurement agrees with its pose yet
     CONTRADICTED = 4  # its newest sightings contradict its pose
     UNCERTAIN = 5  # localized, but its position is uncertain beyond lost_sigma, or by an unknown heading
 

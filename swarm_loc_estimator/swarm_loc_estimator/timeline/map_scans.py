@@ -363,7 +363,7 @@ class FoundPlace(NamedTuple):
 
     pose: FloatArray  # (3,)
     covariance: FloatArray  # (3, 3)
-    is_certain: bool = False  # Whether one scan alone tells it
+    is_certain: bool = False  # Whether the one scan by which it was found tells it alone
 
 
 class MapScans:
@@ -385,7 +385,7 @@ class MapScans:
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
         `sought`, see `MapSearch.around`, and returned. Once a scan contradicts its pose, the robot is not
-        tracked until a scan alone tells the place, or two in a row and odometry agree.
+        tracked until one scan alone tells its place, or the motion between two scans agrees with odometry.
         Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0

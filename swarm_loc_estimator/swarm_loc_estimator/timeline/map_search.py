@@ -236,35 +236,27 @@ class MapSearch:
             reported: (3,) pose by a motion that odometry has left out, if it has.
             least: Share of the beams that must fit.
         """
-        # places around the prediction and around what odometry reports, and farther away
+        # places around the prediction, and around what odometry reports
         beams = SweptBeams.thinned(ends, origin, variance)
-        points = _spread(beams.ends)
         left_out = reported is not None  # maybe the whole turn
         sigma = _AROUND[0] if left_out else np.clip(np.sqrt(np.diag(covariance)), *_AROUND)
         centres = np.array([one for one in (predicted, reported) if one is not None])
-        matched = []
-        for step in (sigma, _AROUND[1]):
-            poses = (centres[:, None] + _OFFSETS * step).reshape(-1, 3)
-            score = _scores(known, points, poses, 0.75 * step[0]) if len(points) else np.zeros(len(poses))
-            order = _largest(score, len(score))
-            near_by = poses[order[_separate(poses[order], score[order], _NEAR_BY)]]
-            found = [match(known.walls, *beams, pose, np.diag(step**2)) for pose in near_by]
-            matched.append(sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True))
+        found = _explaining(known, beams, centres, sigma)
         # the one that explains the scan, if no other does
-        if not matched[0] or matched[0][0].fitting < least:
+        if not found or found[0].fitting < least:
             return None
-        best, rivals = matched[0][0], [0.0, 0.0]
-        for k, other in [(n, one) for n in (0, 1) for one in matched[n]]:
-            square = squared_distance(best.pose, other.pose, best.covariance + other.covariance + _SAME)
-            rivals[k] = max(rivals[k], other.fitting if square > _RIVAL else 0.0)
-        if rivals[0] > best.fitting - DECLINE:
+        best, rival = found[0], _rival(found[0], found)
+        if rival > best.fitting - DECLINE:
             return None
         # walls may not tell all: it may be anywhere between the centres
         way = (centres[-1] - predicted) * [1.0, 1.0, 0.0]
         around = np.linalg.inv(np.diag(sigma**2) + np.outer(way, way))
         covariance = np.linalg.inv(np.linalg.inv(best.covariance) + around)
-        is_clear = best.fitting >= _CLEAR_FIT and best.through <= _CLEAR_THROUGH and best.determined == ALL
-        return FoundPlace(best.pose, covariance, is_clear and best.fitting - max(rivals) > _CLEAR_LEAD)
+        # one scan is enough if no place farther away explains it either
+        is_certain = best.fitting >= _CLEAR_FIT and best.through <= _CLEAR_THROUGH and best.determined == ALL
+        if is_certain:
+            rival = max(rival, _rival(best, _explaining(known, beams, centres, _AROUND[1])))
+        return FoundPlace(best.pose, covariance, is_certain and best.fitting - rival > _CLEAR_LEAD)
 
     def _add(
         self,
@@ -345,6 +337,22 @@ class MapSearch:
         transforms, every = (*search.transform, *transform), (*search.fits, *fits)
         search = search._replace(poses=search.poses[tried:], transform=transforms, fits=every)
         return places._replace(search=search) if len(search.poses) else _searched(places, search)
+
+
+def _explaining(known: SearchMap, beams: SweptBeams, centres: FloatArray, step: FloatArray) -> list[Match]:
+    """Places up to three steps (3,) around centres (c, 3) that explain a scan, the best first."""
+    points, poses = _spread(beams.ends), (centres[:, None] + _OFFSETS * step).reshape(-1, 3)
+    score = _scores(known, points, poses, 0.75 * step[0]) if len(points) else np.zeros(len(poses))
+    order = _largest(score, len(score))
+    near_by = poses[order[_separate(poses[order], score[order], _NEAR_BY)]]
+    found = [match(known.walls, *beams, pose, np.diag(step**2)) for pose in near_by]
+    return sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
+
+
+def _rival(best: Match, found: list[Match]) -> float:
+    """Share of the beams that fit the best of the places that are other ones; 0 without any."""
+    away = [squared_distance(best.pose, one.pose, best.covariance + one.covariance + _SAME) for one in found]
+    return max([one.fitting for one, square in zip(found, away, strict=True) if square > _RIVAL], default=0.0)
 
 
 def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:

@@ -190,11 +190,10 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # a robot that corrects its course by feedback seems to follow its wheels late: no recording is sure
         mean, sigma = np.where(is_delay, mean, typical), np.where(is_delay, sigma, apart)
         # motion and noise by its paths
-        gap_ns = {
-            name: np.median(np.diff(one.stamp_ns)) for name, one in truth.items() if one.stamp_ns.size > 1
-        }
-        dense = {name: truth[name] for name, one in gap_ns.items() if one <= DENSE_GAP_NS}
-        known = solution.paths() | dense
+        known = solution.paths()
+        for name, one in truth.items():
+            if one.stamp_ns.size > 1 and np.median(np.diff(one.stamp_ns)) <= DENSE_GAP_NS:
+                known[name] = one
         paths = {name: one for name, one in known.items() if not truth or name in truth}
         known_by = problem_of(recording, found, fixed=True)
         models = _fitted(recording, begin, known_by, paths, options, solution)

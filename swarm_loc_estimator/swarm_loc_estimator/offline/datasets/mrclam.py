@@ -280,7 +280,10 @@ def convert(
         progress(_SERIALIZING * index / len(robots), f"serializing robot{robot.subject}")
         streams += [_odometry(robot), _detections(robot, delay, rng)]
         if robot.truth is not None:
-            streams.append(_truth(robot.subject, robot.truth, begin_ns, end_ns))
+            inside = (robot.truth.stamp_ns >= begin_ns) & (robot.truth.stamp_ns <= end_ns)
+            stamp_ns = robot.truth.stamp_ns[inside]
+            data = encode_pose_stamped("map", stamp_ns, robot.truth.pose[inside])
+            streams.append(Stream(f"robot{robot.subject}/ground_truth", POSE_STAMPED, stamp_ns, data))
     pairs = zip(dataset.robots, robots, strict=True)
     remarks = [*dataset.remarks, *(remark for whole, used in pairs for remark in _start_remarks(whole, used))]
     count = write_streams(
@@ -401,11 +404,3 @@ def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> Stre
     return Stream(
         f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
     )
-
-
-def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> Stream:
-    """Ground truth between the first and the last odometry."""
-    inside = (truth.stamp_ns >= begin_ns) & (truth.stamp_ns <= end_ns)
-    stamp_ns = truth.stamp_ns[inside]
-    data = encode_pose_stamped("map", stamp_ns, truth.pose[inside])
-    return Stream(f"robot{subject}/ground_truth", POSE_STAMPED, stamp_ns, data)

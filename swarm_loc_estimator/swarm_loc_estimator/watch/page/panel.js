@@ -7,7 +7,7 @@ const SAY_STATUS = {
   waiting: "waits for a sighting or a fix that locates it",
   tracked: "tracked",
   stale: "its odometry is silent: the last known pose",
-  unconfirmed: "where its description says; no sighting has confirmed it",
+  unconfirmed: "located, but nothing measured since agrees with its pose",
   contradicted: "its newest sightings do not agree with its pose",
   uncertain: "its position is uncertain beyond the limit: too long unseen",
 };
