@@ -11,7 +11,7 @@ import pytest
 
 from bench.shared.room_run import placed_world, record_room
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, clearance
-from swarm_loc_drivers.sim.room.sensors import CeilingCameras, Lidar, Radios, sensors_of
+from swarm_loc_drivers.sim.room.sensors import CeilingCameras, Lidar, Radios, cast, sensors_of
 from swarm_loc_drivers.sim.room.world import STEP_NS, drawn, room_of, room_starts
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.cli import new
@@ -22,6 +22,7 @@ from swarm_loc_estimator.offline.calibration.models import Options, fit_models
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Localizer, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -115,18 +116,46 @@ def test_ranges_are_distances_in_space_with_the_biases_of_both_ends(tmp_path: Pa
 def test_a_sweep_of_a_robot_that_stands_shows_walls_and_the_other_robot() -> None:
     names = ("a", "b")
     robots = tuple(Robot(name, camera=None, start=(0.5 * k, 0.0, 0.0)) for k, name in enumerate(names))
-    robots = tuple(replace(one, lidar=replace(one.lidar, range_sigma=1e-9)) for one in robots)
+    others = {"scan_rear": {"yaw": math.pi}}
+    robots = tuple(replace(one, lidar=LidarModel(range_sigma=1e-9, others=others)) for one in robots)
     swarm = Swarm(tuple(replace(one, said=frozenset({"lidar.yaw"})) for one in robots))
     world = placed_world(swarm, "w0", 1)
     world.poses = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     (lidar,) = (one for one in sensors_of(world) if isinstance(one, Lidar))
     world.now_ns += 10**9
-    _, (topic, data) = next(iter(lidar.messages()))
-    scan = decode_scan(data)
-    assert topic == "a/scan"
+    scans = {topic: decode_scan(data) for _, (topic, data) in lidar.messages()}
+    assert [*scans] == ["a/scan", "a/scan_rear", "b/scan", "b/scan_rear"]
+    scan, rear = scans["a/scan"], scans["a/scan_rear"]
+    assert (scan.frame_id, rear.frame_id) == ("a/laser", "a/scan_rear")
+    assert np.roll(rear.ranges, 180) == pytest.approx(scan.ranges, abs=0.05)
     assert scan.ranges[180] == pytest.approx(0.5 - world.radii[1], abs=0.03)  # ahead
     assert scan.ranges[0] == pytest.approx(1.2, abs=0.05)  # behind
     assert scan.ranges[90] == pytest.approx(0.8, abs=0.05)  # to the right
+
+
+def test_each_beam_of_a_sweep_is_measured_where_the_robot_then_is() -> None:
+    """Also where its turn rate changes during the sweep."""
+    lidar = LidarModel(range_sigma=1e-9, range_sigma_per_m=0.0, max_range=50.0, x=0.1)
+    robot = Robot("a", camera=None, start=(0.0, 0.0, 0.3), lidar=lidar, said=frozenset({"lidar.x"}))
+    world = placed_world(Swarm((robot,)), "w0", 5, "office")
+    (sensor,) = (one for one in sensors_of(world) if isinstance(one, Lidar))
+    track, off = [world.poses[0]], []
+    for _ in range(400):
+        world.step()
+        track.append(world.poses[0])
+        for _, (_, data) in sensor.messages():
+            at = np.arange(360) * 20 / 360
+            steps = np.floor(at).astype(int)
+            before, after = (np.array(track[-21:])[steps + k] for k in (0, 1))
+            share = (at - steps)[:, None]
+            rays = se2.compose(
+                se2.compose(before, se2.exp(share * se2.log(se2.between(before, after)))), [0.1, 0.0, 0.0]
+            )
+            angles = rays[:, 2] - math.pi + np.arange(360) * math.pi / 180.0
+            seen = cast(world.walls, NOBODY, 0.1, rays[:, :2], angles)
+            off.append(np.abs(decode_scan(data).ranges - seen).max())
+    assert len(off) == 20
+    assert max(off) < 1e-3
 
 
 @pytest.mark.timeout(300)  # starts that are found from ranges take a while on a busy machine

@@ -109,7 +109,10 @@ def properties(specs: Mapping[str, Spec], cls: type | None = None) -> Schema:
 
 def to_tree(holder: Any, keep: Collection[str] = (), without: Collection[str] = ()) -> dict[str, Tree]:
     """The entries of a dataclass that differ from their defaults or are to be kept."""
-    defaults = {one.name: one.default for one in fields(holder)}
+    defaults = {
+        one.name: one.default if one.default_factory is MISSING else one.default_factory()
+        for one in fields(holder)
+    }
     values = {name: getattr(holder, name) for name in entry_specs(type(holder), without)}
     return {
         name: to_tree(value) if is_dataclass(value) else _lists(value)

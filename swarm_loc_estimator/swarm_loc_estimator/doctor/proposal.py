@@ -34,6 +34,7 @@ from swarm_loc_estimator.offline.recorded_bag import Progress, same_type
 from swarm_loc_estimator.offline.survey.survey import place_fixed
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, NO_DETECTIONS
 from swarm_loc_estimator.sensors.inputs import TRUTH, kinds
+from swarm_loc_estimator.sensors.lidar import ScanSensor
 from swarm_loc_estimator.sensors.localizers import SOURCES, BodyPose
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.swarm.error_models import ClockModel, FixModel, OdometryModel, RandomWalk
@@ -204,13 +205,27 @@ def robot_topics(topics: Mapping[str, Heard]) -> dict[str, dict[str, str]]:
             if robot is None and words[1:] == [kind.topic] and not (driven and kind.of_cameras):
                 robot = _named(words[0])
             if robot is not None:
-                found.setdefault(robot, {}).setdefault(kind.topic, name)
+                own, used = kind.topic, found.setdefault(robot, {})
+                if kind.name == ScanSensor.name and own in used:  # of another lidar, if in another frame
+                    frames = map(_frame, _scans(topics, used).values())
+                    own = own if _frame(heard) in frames else name.rpartition(f"{robot}/")[2]
+                used.setdefault(own, name)
     for robot, used in found.items():
         truth = [name for name in topics if TRUTH in name and robot in map(_named, name.split("/"))]
         used.update({TRUTH: truth[0]} if truth else {})
     # text and numbers of a name by turns
     parts = {name: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", name)] for name in found}
     return {name: found[name] for name in sorted(found, key=parts.__getitem__)}
+
+
+def _scans(topics: Mapping[str, Heard], used: Mapping[str, str]) -> dict[str, Heard]:
+    """The scans of a robot, by its own topics."""
+    return {own: topics[name] for own, name in used.items() if same_type(topics[name].type, LASER_SCAN)}
+
+
+def _frame(heard: Heard) -> str:
+    """The frame of messages."""
+    return next((str(message.header.frame_id) for _, message in decoded(heard, 1)[0]), "")
 
 
 def _named(word: str) -> str:
@@ -236,12 +251,7 @@ def _renamed(used: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
 
 def likely_type(topics: Mapping[str, Heard], used: Mapping[str, Mapping[str, str]]) -> str:
     """The type of `KNOWN_ROBOTS` whose name or lidar frame the robots have; "own" if there is none."""
-    frames = {
-        message.header.frame_id
-        for heard in topics.values()
-        if same_type(heard.type, LASER_SCAN)
-        for _, message in decoded(heard, 1)[0]
-    }
+    frames = {_frame(heard) for heard in topics.values() if same_type(heard.type, LASER_SCAN)}
     for name, known in KNOWN_ROBOTS.items():
         if known.lidar_frame and any(frame.endswith(known.lidar_frame) for frame in frames):
             return name
@@ -266,7 +276,11 @@ def _sensors(draft: _Draft, name: str, used: Mapping[str, str], known_type: str)
     if "imu" in used:
         fields["imu"] = known.imu if known.imu.is_used else GYROSCOPE
     if "scan" in used:
-        fields["lidar"] = known.lidar if known.lidar.is_used else LIDAR
+        others: dict[str, dict[str, float]] = {own: {} for own in _scans(draft.topics, used) if own != "scan"}
+        fields["lidar"] = replace(known.lidar if known.lidar.is_used else LIDAR, others=others)
+        if others:
+            problem = f"has scans on {listed(['scan', *others])}"
+            draft.ask(name, problem, "Remove what repeats the scans of another topic from lidar.others")
     if any(same_type(one.type, LASER) and name in topic.split("/") for topic, one in draft.topics.items()):
         fields["fix"] = FixModel(systematic_share=1.0)  # of mapper_node
     if "brightness" in used:

@@ -291,7 +291,7 @@ class SwarmState:
         self.windows: dict[tuple[int, bool], Any] = {}
         self.next_attempt_ns: IntArray = np.full((robots, 2), NEVER_NS)
         self.images: IdentityMemory | None = None  # None before the first aerial image
-        self.delays: dict[int, Any] = {}  # Of lidars, by robot, of `mapping.messages.DelayBelief`
+        self.delays: dict[tuple[int, int], Any] = {}  # `mapping.messages.DelayBelief` by robot and lidar
         self.map: Any = None  # Of lidars, of `map_search.SearchMap`; None: there is none yet
         # Where robots with lidars that are not located may be in it, of `map_search.PossiblePlaces`
         self.places: dict[int, Any] = {}

@@ -188,9 +188,9 @@ class SweepPairer(OdometryQueue):
 
     def _stop(self, sweep: LidarSweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
         """The sweep from a pose (3,) of the robot, which had moved by `motion` (n, 3) at each beam."""
-        lidar, seen = self.lidar, sweep.seen
+        lidar, seen = sweep.lidar, sweep.seen
         distance = np.where(seen, sweep.distance, sweep.reach)
-        x, y = sweep.ends(lidar, motion).T
+        x, y = sweep.ends(motion).T
         noise = (lidar.range_sigma + lidar.range_sigma_per_m * distance) / distance**2
         sigma = (lidar.range_sigma + lidar.range_sigma_per_m * sweep.reach) / sweep.reach**2
         scan = Scan(

@@ -32,7 +32,7 @@ from swarm_loc_estimator.common.messages.cdr import (
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.common.se2 import between, compose, transform_points, wrap_angle
-from swarm_loc_estimator.swarm.error_models import LidarModel
+from swarm_loc_estimator.swarm.error_models import SingleLidar
 from swarm_loc_estimator.swarm.swarm import Robot
 
 MAX_CELLS = 4_000_000  # Maximum number of cells of a valid map
@@ -47,7 +47,9 @@ _WILD, _NOISE_SHARE = 400.0, 0.1
 """Squares from which odometry is wrong at any lag and tells nothing, and weight of one in its usual noise."""
 _BACKWARDS, _SURE_ORDER = -2.0, 4.0
 """Log odds that the header says the order of the beams wrongly, at first and from which on it is known."""
-_NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
+_NEAR_S, _REFUTED, _LASTS_NS = 0.06, 0.05, 3_000_000_000
+"""A delay is refuted if it, and those so near, have had less chance than this for so long."""
+_LIKELY = 2**62  # Stamp of what has not happened [ns]
 _NOWHERE = np.full((3, 3), np.nan)
 
 
@@ -102,6 +104,7 @@ class ScanMessage(NamedTuple):
     range_max: float  #: [m]
     ranges: FloatArray  #: (b,) [m]
     frame_id: str = ""  #: Of the lidar
+    lidar: int = 0  #: Number of the lidar in `LidarModel.all` of its robot
 
 
 class LightMessage(NamedTuple):
@@ -122,9 +125,9 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
+    numbers = [float(getattr(message, name)) for name in ScanMessage._fields[1:-3]]
     header, ranges = message.header, message.ranges.astype(float)
-    return ScanMessage(nanoseconds(header.stamp), **numbers, ranges=ranges, frame_id=header.frame_id)
+    return ScanMessage(nanoseconds(header.stamp), *numbers, ranges, header.frame_id)
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
@@ -169,31 +172,36 @@ class LidarSweep(NamedTuple):
     angle: FloatArray  # (n,) directions in the frame of the lidar [rad]
     distance: FloatArray  # (n,) [m]; infinite: nothing up to `reach`
     reach: float  # Range of the lidar [m]
+    lidar: SingleLidar  # Its mount and noise
+    number: int  # Of the lidar, see `ScanMessage`
 
     @property
     def seen(self) -> BoolArray:
         """(n,) True for beams that met something."""
         return np.isfinite(self.distance)
 
+    @property
+    def last_ns(self) -> int:
+        """Time from which on all beams have been measured; stamps may be late."""
+        return self.stamp_ns + max(0, self.duration_ns) + round(-1e9 * min(0.0, self.lidar.delay_s))
+
     def backwards(self) -> LidarSweep:
         """The same beams in the other order of time."""
         return self._replace(beam_ns=2 * self.stamp_ns + self.duration_ns - self.beam_ns)
 
-    def ends(self, lidar: LidarModel, motion: FloatArray) -> FloatArray:
+    def ends(self, motion: FloatArray) -> FloatArray:
         """Ends (n, 2) of the beams, at `reach` where they met nothing.
 
-        Args:
-            lidar: Its mount.
-            motion: (n, 3) pose of the robot at each beam, in the frame of the ends.
+        `motion` (n, 3) is the pose of the robot at each beam, in the frame of the ends.
         """
-        distance = np.minimum(self.distance, self.reach)
+        lidar, distance = self.lidar, np.minimum(self.distance, self.reach)
         across = math.cos(lidar.roll)  # walls are vertical, and a lidar upside down sees them mirrored
         ray = distance[:, None] * np.stack([np.cos(self.angle), across * np.sin(self.angle)], axis=-1)
         return transform_points(compose(motion, np.array([lidar.x, lidar.y, lidar.yaw])), ray)
 
 
 def read_sweep(
-    scan: ScanMessage, lidar: LidarModel, drops: Counter[str], dropped_beams: Counter[str]
+    scan: ScanMessage, lidar: SingleLidar, drops: Counter[str], dropped_beams: Counter[str]
 ) -> LidarSweep | None:
     """The valid beams of a scan; beam i points to angle_min + i * angle_increment, however many there are.
 
@@ -201,7 +209,7 @@ def read_sweep(
 
     Args:
         scan: The message.
-        lidar: Its range.
+        lidar: The lidar that sent it.
         drops: Counts unusable scans by reason.
         dropped_beams: Counts unusable beams by reason.
 
@@ -239,7 +247,8 @@ def read_sweep(
     beam_ns = begin_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
     distance = np.where(scan.ranges[used] > min(nothing, reach), math.inf, scan.ranges[used])
     angle = scan.angle_min + used.astype(float) * step
-    return LidarSweep(begin_ns, round(1e9 * duration_s), beam_ns, angle, distance, reach)
+    duration_ns = round(1e9 * duration_s)
+    return LidarSweep(begin_ns, duration_ns, beam_ns, angle, distance, reach, lidar, scan.lidar)
 
 
 class DelayBelief(NamedTuple):
@@ -253,6 +262,7 @@ class DelayBelief(NamedTuple):
     track: FloatArray  # (L, 3) this pose by odometry, at each lag
     backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
     noise: float = 1.0  # Mean of recent squares: how much worse odometry is than assumed
+    unlikely_ns: int = _LIKELY  # Stamp since when the described delay has hardly any chance
     #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
     anchor: FloatArray = _NOWHERE
 
@@ -274,13 +284,15 @@ class DelayBelief(NamedTuple):
     @property
     def is_refuted(self) -> bool:
         """Whether the described delay is wrong."""
-        return bool(self.chance[np.abs(self.lag_s) <= _NEAR_S].sum() < _REFUTED)
+        return self.unlikely_ns + _LASTS_NS <= self.stamp_ns
 
-    def sentence(self, robot: Robot) -> str:
-        """How old the scans of a robot are, and what to describe."""
+    def sentence(self, robot: Robot, number: int = 0) -> str:
+        """How old the scans of one of the lidars of a robot are, and what to describe."""
+        topic, lidar = list(robot.lidar.all.items())[number]
+        whose, key = (f"{robot.name}/{topic}", f"others.{topic}.") if number else (robot.name, "")
         older = "older" if self.mean_s > 0.0 else "newer"
-        text = f"the scans of {robot.name} are {abs(self.mean_s):.2f} +- {self.sigma_s:.2f} s {older} than"
-        text += f" described: set lidar.delay_s to {robot.lidar.delay_s - self.mean_s:.2f}, or correct their"
+        text = f"the scans of {whose} are {abs(self.mean_s):.2f} +- {self.sigma_s:.2f} s {older} than"
+        text += f" described: set lidar.{key}delay_s to {lidar.delay_s - self.mean_s:.2f}, or correct their"
         return f"{text} stamps"
 
 
@@ -325,9 +337,10 @@ def learned_delay(
             transition * (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
         )
         chance = chance / chance.sum() if squares.min() < _WILD else before.chance
-    return before._replace(
-        chance=chance, stamp_ns=stamp_ns, seen=seen, covariance=own, track=track, noise=noisiness
-    )
+    is_unlikely = chance[np.abs(before.lag_s) <= _NEAR_S].sum() < _REFUTED
+    since_ns = min(before.unlikely_ns, stamp_ns) if is_unlikely else _LIKELY
+    before = before._replace(chance=chance, noise=noisiness, unlikely_ns=since_ns)
+    return before._replace(stamp_ns=stamp_ns, seen=seen, covariance=own, track=track)
 
 
 def at_odometry(belief: DelayBelief, now: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -105,7 +105,7 @@ class InputTopic:
     robot: int  # Index into `Swarm.sources`, or THE_SWARM
     # True if missing messages are an error; False for detections of a robot without camera
     expected: bool = True
-    device: int = 0  # Address of the other radio on the topic of a pair
+    device: int = 0  # Address of the other radio on the topic of a pair; number among `InputKind.topics_of`
 
 
 def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
@@ -114,18 +114,20 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     With `maps` also those that are of use to a mapper, or in a map that is not described. Raises UserError if
     `Swarm.topics` has a topic that is not read, or two topics are the same.
     """
-    known = {kind.topic for kind in kinds().values() if kind.of_each} | {TRUTH}
+    each = [kind for kind in kinds().values() if kind.of_each]
+    known = {TRUTH, *(kind.topic for kind in each)}
+    known |= {topic for kind in each for robot in swarm.robots for topic in kind.topics_of(robot)}
     if unknown := [key for key in swarm.topics if key.partition("/")[2] not in known]:
         raise UserError(f"topics has {unknown[0]}, but topics of robots are {', '.join(sorted(known))}.")
     of_robots = (
-        InputTopic(swarm.topic(robot.name, kind.topic), kind, index, kind.expected_of(robot))
+        InputTopic(swarm.topic(robot.name, topic), kind, index, kind.expected_of(robot), number)
         for index, robot in enumerate(swarm.robots)
-        for kind in kinds().values()
-        if kind.of_each
-        and not kind.of_pairs
+        for kind in each
+        if not kind.of_pairs
         and not (swarm.range_topic and kind.name == RangeSensor.name)
         and (kind.expected_of(robot) or not kind.only_expected)
         and (maps or swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
+        for number, topic in enumerate(kind.topics_of(robot))
     )
     of_cameras = (
         InputTopic(swarm.topic(camera.name, kind.topic), kind, index)

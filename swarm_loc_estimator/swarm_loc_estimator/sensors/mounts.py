@@ -52,7 +52,7 @@ class Said(NamedTuple):
     """A number of a mount that transforms and the description say differently."""
 
     robot: str
-    key: str  # Such as "lidar.yaw"
+    key: str  # Such as "lidar.yaw" or "lidar.others.scan_rear.yaw"
     described: float
     by_transforms: float
 
@@ -63,7 +63,7 @@ class Mounts:
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
         self._joints: dict[str, dict[str, _Joint]] = {}  # By the prefix of the topic
-        self._frames: dict[tuple[int, str], str] = {}  # Of a sensor of a robot
+        self._frames: dict[tuple[int, str, int], str] = {}  # Of a sensor of a robot, and its `device`
         self.topics: dict[str, InputTopic] = {
             topic.name: topic
             for topic in input_topics(swarm, maps=True)
@@ -89,7 +89,7 @@ class Mounts:
 
     def add_frame(self, topic: InputTopic, frame: str) -> None:
         """Add the frame of a sensor's messages."""
-        self._frames[topic.robot, topic.kind.name] = frame.lstrip("/")
+        self._frames[topic.robot, topic.kind.name, topic.device] = frame.lstrip("/")
 
     def add_message(self, topic: str, data: bytes) -> None:
         """Add a serialized message of transforms or of a sensor; what is no whole message is left out."""
@@ -104,9 +104,9 @@ class Mounts:
         """The swarm with all mounts, where the description says nothing of them."""
         robots = list(self._swarm.robots)
         for index, section, key, value in self._known():
-            if not _says(self._swarm.robots[index], section, key):
+            if _said(self._swarm.robots[index], section, key) is None:
                 model: Any = getattr(robots[index], section)
-                changed: Any = {section: replace(model, **{key: value})}
+                changed: Any = {section: _changed(model, key, value)}
                 robots[index] = replace(robots[index], **changed)
         return replace(self._swarm, robots=tuple(robots))
 
@@ -115,11 +115,12 @@ class Mounts:
         found = []
         for index, section, key, value in self._known():
             robot = self._swarm.robots[index]
-            described = float(getattr(getattr(robot, section), key))
-            off = value - described
-            if key not in ("x", "y", "z"):
+            said = _said(robot, section, key)
+            described = 0.0 if said is None else said
+            off, number = value - described, key.rpartition(".")[2]
+            if number not in ("x", "y", "z"):
                 off = math.remainder(off, 2.0 * math.pi)
-            if _says(robot, section, key) and abs(off) > _APART[key]:
+            if said is not None and abs(off) > _APART[number]:
                 found.append(Said(robot.name, f"{section}.{key}", described, value))
         return found
 
@@ -127,7 +128,7 @@ class Mounts:
         """A sentence for each mount that is not as described."""
         after: dict[tuple[int, str], list[str]] = {}
         for index, section, key, value in self._known():
-            if not _says(self._swarm.robots[index], section, key) and value:
+            if _said(self._swarm.robots[index], section, key) is None and value:
                 after.setdefault((index, section), []).append(f"{key} {value:.3f}")
         names = [robot.name for robot in self._swarm.robots]
         return [
@@ -137,11 +138,12 @@ class Mounts:
 
     def _known(self) -> Iterator[tuple[int, str, str, float]]:
         """Index of the robot, section, key and value of all numbers of mounts that transforms tell."""
-        for (index, sensor), frame in sorted(self._frames.items()):
+        for (index, sensor, device), frame in sorted(self._frames.items()):
             mount = self._mount(index, frame)
             if mount is None:
                 continue
             section, keys = _SECTIONS[sensor]
+            inside = f"others.{list(self._swarm.robots[index].lidar.all)[device]}." if device else ""
             if section == "camera" and "optical" in frame:
                 mount = mount._replace(rotation=mount.rotation @ FROM_OPTICAL.T)
             r = mount.rotation
@@ -152,7 +154,7 @@ class Mounts:
             }
             values = dict(zip(("x", "y", "z"), mount.place.tolist(), strict=True)) | angles
             for key in keys:
-                yield index, section, key, round(values[key], 9) + 0.0
+                yield index, section, inside + key, round(values[key], 9) + 0.0
 
     def _mount(self, robot: int, frame: str) -> _Joint | None:
         """The pose of a frame in that of its robot; None if no transforms lead there."""
@@ -170,8 +172,21 @@ class Mounts:
         return next((found[base] for base in _BASES if base in found), None)
 
 
-def _says(robot: Robot, section: str, key: str) -> bool:
-    """Whether the description says a number."""
+def _said(robot: Robot, section: str, key: str) -> float | None:
+    """A number that the description says; None: it does not."""
     model: Any = getattr(robot, section)
+    others, _, number = key.rpartition(".")
+    if others:
+        return robot.lidar.others[others.partition(".")[2]].get(number)
     default = type(model).__dataclass_fields__[key].default
-    return f"{section}.{key}" in robot.said or getattr(model, key) != default
+    is_said = f"{section}.{key}" in robot.said or getattr(model, key) != default
+    return float(getattr(model, key)) if is_said else None
+
+
+def _changed(model: Any, key: str, value: float) -> Any:
+    """A section with a number."""
+    others, _, number = key.rpartition(".")
+    if not others:
+        return replace(model, **{key: value})
+    topic = others.partition(".")[2]
+    return replace(model, others={**model.others, topic: {**model.others[topic], number: value}})

@@ -65,7 +65,7 @@ class Known(NamedTuple):
     map_frame: str  #: Name of the frame `map` in messages
     robots: int  #: Number of robots in the swarm
     swarm: int  #: Number that identifies the swarm in messages of many robots, see `swarm_key`
-    devices: NDArray[np.uint64]  #: (t,) address of the other radio of each topic of a pair; 0 for others
+    devices: NDArray[np.uint64]  #: (t,) `InputTopic.device` of each topic
 
 
 class Reader(Protocol):
@@ -140,6 +140,7 @@ class InputKind:
     #: returns the number of unused valid readings by reason
     columns_of: Callable[[Any, MessageBatch, IntArray, Known], tuple[Any, Mapping[str, int]]]
     expected_of: Callable[[Robot], bool]  #: True if a missing topic of the robot is an error
+    topics_of: Callable[[Robot], tuple[str, ...]]  #: Its topics of a robot, relative to its namespace
     of_each: bool = True  #: True if each robot has its own topic
     only_expected: bool = False  #: True if robots of which it is not expected have no such topic
     of_cameras: bool = False  #: True if each fixed camera has such a topic, too
@@ -299,6 +300,11 @@ class Sensor:
         return True
 
     @classmethod
+    def topics_of(cls, _robot: Robot) -> tuple[str, ...]:
+        """Its topics of a robot, several if it has several such sensors."""
+        return (cls.topic,)
+
+    @classmethod
     def fault_of(cls, message: Any, map_frame: str) -> str:
         """Reason to drop a message, "" if there is none."""
         return f"{cls.topic.partition('/')[0]}_frame" if cls.in_map and message.frame_id != map_frame else ""
@@ -348,8 +354,8 @@ class Sensor:
     def kinds(cls) -> tuple[InputKind, ...]:
         """Kinds of its topics."""
         own = InputKind(
-            cls.name, cls.topic, cls.message_type, cls.create_reader, cls._read, cls.expected_of, cls.of_each,
-            cls.only_expected, cls.of_cameras, cls.in_map, cls.needs_map,
+            cls.name, cls.topic, cls.message_type, cls.create_reader, cls._read, cls.expected_of,
+            cls.topics_of, cls.of_each, cls.only_expected, cls.of_cameras, cls.in_map, cls.needs_map,
         )  # fmt: skip
         return (own,) if cls.shared is None else (own, _shared_kind(own, cls.shared, cls.nothing()))
 

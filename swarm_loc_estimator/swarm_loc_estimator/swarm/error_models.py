@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
-from swarm_loc_estimator.common.codec import EntrySpec, TreeChecks, entry, listed
+from swarm_loc_estimator.common.codec import (
+    EntrySpec,
+    Tree,
+    TreeChecks,
+    entry,
+    entry_specs,
+    listed,
+    properties,
+)
 from swarm_loc_estimator.common.parameters import estimated, gate, number, positive
 
 
@@ -128,8 +138,8 @@ class ImuModel:
 
 
 @dataclass(frozen=True)
-class LidarModel:
-    """Mount and noise of a robot's 2-D lidar, for mapping and for localization in a map."""
+class SingleLidar:
+    """Mount and noise of a 2-D lidar."""
 
     range_sigma: float = number(0.0, "m", 0.0, 1.0, "noise of a range; 0: the robot has no lidar")
     range_sigma_per_m: float = number(0.01, "1", 0.0, 1.0, "growth of this noise with the range [m per m]")
@@ -140,13 +150,51 @@ class LidarModel:
     delay_s: float = number(0.0, "s", -2.0, 2.0, "beams are measured this much after their stamps")
     min_range: float = number(0.0, "m", 0.0, 10.0, "nearer ranges are dropped, as those below range_min")
     max_range: float = number(12.0, "m", 0.2, 50.0, "greatest range, up to which space is free", above=True)
-    map_sigma: float = number(0.02, "m", 0.0, 1.0, "error of the map's walls, added to that of its cells")
+    map_sigma: float = number(0.05, "m", 0.0, 1.0, "error of the map's walls, added to that of its cells")
     robot_radius: float = number(0.0, "m", 0.0, 5.0, "of bodies of other robots that it sees; 0: sees none")
 
     @property
     def is_used(self) -> bool:
-        """Whether the robot has a lidar."""
+        """Whether the robot has it."""
         return self.range_sigma > 0.0
+
+
+def _read_others(checks: TreeChecks, tree: Tree, key: str) -> dict[str, dict[str, float]]:
+    """Read `LidarModel.others`."""
+    lidars = checks.mapping(tree, key)
+    for topic in lidars:
+        if not isinstance(topic, str) or not re.fullmatch(r"\w+(/\w+)*", topic):
+            raise checks.error(f"a name in {key}", topic, "must be a topic of the robot, such as scan_rear")
+    specs = entry_specs(SingleLidar)
+    return {topic: checks.values(values, f"{key}.{topic}", specs) for topic, values in lidars.items()}
+
+
+_OTHERS = {
+    "type": "object",
+    "additionalProperties": {
+        "type": "object",
+        "properties": properties(entry_specs(SingleLidar)),
+        "additionalProperties": False,
+    },
+}
+
+
+@dataclass(frozen=True)
+class LidarModel(SingleLidar):
+    """The lidar of a robot, for mapping and for localization in a map, and others for localization."""
+
+    #: Topic of another lidar -> its mount, and what else differs from this one
+    others: Mapping[str, Mapping[str, float]] = field(
+        default_factory=dict, metadata=entry(EntrySpec(_read_others, _OTHERS))
+    )
+
+    @property
+    def all(self) -> dict[str, SingleLidar]:
+        """Topic -> lidar of all lidars of the robot, this one first."""
+        common = {one.name: getattr(self, one.name) for one in fields(SingleLidar)}
+        common |= dict.fromkeys(("x", "y", "yaw", "roll"), 0.0)
+        others = {topic: SingleLidar(**{**common, **own}) for topic, own in self.others.items()}
+        return {"scan": self, **others}
 
     @property
     def sees_robots(self) -> bool:

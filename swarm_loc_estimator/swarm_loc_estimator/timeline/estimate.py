@@ -289,14 +289,13 @@ def contradictions(
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
         *(
-            Contradiction(f"lidar of {names[k]}", Contradicted.LATE, one.sentence(swarm.robots[k]))
-            for k, one in state.delays.items()
+            Contradiction(f"lidar of {names[k]}", Contradicted.LATE, one.sentence(swarm.robots[k], number))
+            for (k, number), one in state.delays.items()
             if one.is_refuted
         ),
         *(
             _of_robot(names[one], Contradicted.BACKWARDS)
-            for one in sorted(state.delays)
-            if state.delays[one].is_backwards
+            for one in sorted({k for (k, _), delay in state.delays.items() if delay.is_backwards})
         ),
         *(
             one

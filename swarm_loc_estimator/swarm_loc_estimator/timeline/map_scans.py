@@ -371,12 +371,12 @@ class MapScans:
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self.tracks, self._sweeps = tracks, sweeps
-        self._lidars = [robot.lidar for robot in swarm.robots]
         self._limits = TrackedLimits.of(swarm, settings)
 
-    def walls_of(self, walls: WallMap, robot: int) -> WallMap:
-        """The map with the error that the description of a robot says."""
-        return walls._replace(variance=walls.variance + self._lidars[robot].map_sigma ** 2)
+    @staticmethod
+    def walls_for(sweep: LidarSweep, walls: WallMap) -> WallMap:
+        """The map with the error that the description of a lidar says."""
+        return walls._replace(variance=walls.variance + sweep.lidar.map_sigma**2)
 
     def fix_of(
         self, state: SwarmState, one: Measurements, sweep: LidarSweep, sought: SoughtAround
@@ -389,11 +389,12 @@ class MapScans:
         Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
+        lidar = robot, sweep.number
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
         pose, covariance = estimate.poses[robot], estimate.covariances[robot]
-        walls = self.walls_of(state.map.walls, robot)
+        walls = self.walls_for(sweep, state.map.walls)
         # The scan may be older than its stamp says.
-        delay = state.delays.get(robot) or described_delay(self._lidars[robot].delay_s)
+        delay = state.delays.get(lidar) or described_delay(sweep.lidar.delay_s)
         best = int(delay.chance.argmax())
         beams, now, track = self.beams(robot, stamp_ns, sweep, delay.lag_s, best)
         back = between(now, track[best])
@@ -409,7 +410,7 @@ class MapScans:
             delay = delay._replace(backwards=delay.backwards + (news if is_open else 0.0))
             if delay.backwards > 0.0:
                 found, beams = other, reversed_beams
-        state.delays[robot] = delay
+        state.delays[lidar] = delay
         # Odometry may have left out a motion, which it reports or not, or the pose was wrong before.
         anchor = np.stack([found.pose, now, self.tracks.at(np.array([robot]), np.array([stamp_ns])).raw[0]])
         reported, follows = self._left_out(delay, anchor, covariance)
@@ -424,7 +425,7 @@ class MapScans:
             place = sought(state.map._replace(walls=walls), *beams, pose, covariance, reported, least)
             if place is not None and (is_lost or place.is_certain):
                 anchor[0] = place.pose
-                state.delays[robot] = delay._replace(anchor=anchor, stamp_ns=-1)
+                state.delays[lidar] = delay._replace(anchor=anchor, stamp_ns=-1)
                 return place, Verdict.USED, place.is_certain
         # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
@@ -432,7 +433,7 @@ class MapScans:
                 best = int(delay.chance.argmax())
                 driven = math.dist(delay.track[best, :2], track[best, :2])
             delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
-            delay = state.delays[robot] = delay._replace(anchor=anchor)
+            delay = state.delays[lidar] = delay._replace(anchor=anchor)
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
             state.sources.confirmations[robot] = min(confirmations, CONFIRMED)
@@ -491,11 +492,11 @@ class MapScans:
 
         And poses by odometry: then (3,), and in the middle of the sweep at each lag (L, 3).
         """
-        lidar, seen, beams = self._lidars[robot], sweep.seen, sweep.beam_ns.size
+        lidar, seen, beams = sweep.lidar, sweep.seen, sweep.beam_ns.size
         lag_ns, middle_ns = np.round(1e9 * lag_s).astype(np.int64), sweep.stamp_ns + sweep.duration_ns // 2
         at_ns = np.concatenate([sweep.beam_ns - lag_ns[best], [stamp_ns], middle_ns - lag_ns])
         poses = self.tracks.at(np.full(at_ns.size, robot), at_ns).pose
-        ends = sweep.ends(lidar, between(poses[beams], poses[:beams]))[seen]
+        ends = sweep.ends(between(poses[beams], poses[:beams]))[seen]
         sigma = lidar.range_sigma + lidar.range_sigma_per_m * sweep.distance[seen]
         return (ends, np.array([lidar.x, lidar.y]), sigma**2), poses[beams], poses[beams + 1 :]
 

@@ -193,12 +193,12 @@ class MapSearch:
         sweep, described = scans.sweep_of(one), self._robots[robot]
         if sweep is None or described.stands or not scans.tracks.has_started(robot, sweep.stamp_ns):
             return None, Verdict.NOT_LOCALIZED
-        before, walls = state.places.get(robot), scans.walls_of(state.map.walls, robot)
+        before, walls = state.places.get(robot), scans.walls_for(sweep, state.map.walls)
         known = state.map._replace(walls=walls)
         if before is not None and before.search is not None:
             state.places[robot] = places = self._advanced(before, before.search, known)
             return None, _why_nowhere(places)
-        delay = state.delays.get(robot) or described_delay(described.lidar.delay_s)
+        delay = state.delays.get((robot, sweep.number)) or described_delay(sweep.lidar.delay_s)
         if scans.turned(robot, sweep) > _SEARCH_TURN:
             return None, _why_nowhere(before)  # its delay and order of beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep

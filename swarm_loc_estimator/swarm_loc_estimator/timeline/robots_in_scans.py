@@ -57,7 +57,7 @@ class RobotsInScans:
     """Finds located robots in scans; `scans` knows the beams of sweeps."""
 
     def __init__(self, swarm: Swarm, settings: Settings, scans: MapScans) -> None:
-        self._scans, self._lidars = scans, [robot.lidar for robot in swarm.robots]
+        self._scans = scans
         self._limits = TrackedLimits.of(swarm, settings)
         self._probability = settings.aerial_probability
         self._gate = float(gate_threshold(settings.aerial_gate_probability))
@@ -68,13 +68,13 @@ class RobotsInScans:
     ) -> tuple[LidarSweep, Measurements]:
         """The sweep of a located robot without the beams that end at others, and sightings (k,) of these."""
         robot, stamp_ns, tracks = int(one.target), int(one.stamp_ns), self._scans.tracks
-        lidar, known = self._lidars[robot], state.tracked.copy()
+        lidar, known = sweep.lidar, state.tracked.copy()
         known[robot] = False
         others = np.flatnonzero(known)
         if not others.size:
             return sweep, NO_MEASUREMENTS
         # beams and robots, at the stamp of the scan
-        delay = state.delays.get(robot) or described_delay(lidar.delay_s)
+        delay = state.delays.get((robot, sweep.number)) or described_delay(lidar.delay_s)
         turned, best = sweep.backwards() if delay.backwards > 0.0 else sweep, int(delay.chance.argmax())
         (ends, origin, variance), now, _ = self._scans.beams(robot, stamp_ns, turned, delay.lag_s, best)
         at_ns = turned.beam_ns[turned.seen] - round(1e9 * float(delay.lag_s[best]))

@@ -55,9 +55,9 @@ def changed(ranges: list[float], **fields: Any) -> ScanMessage:
     return ScanMessage(5, 0.0, last, 0.1, 0.0, 0.2, 4.0, np.array(ranges))._replace(**fields)
 
 
-def swept(scan: ScanMessage) -> LidarSweep:
+def swept(scan: ScanMessage, lidar: LidarModel = LidarModel(range_sigma=0.01)) -> LidarSweep:
     drops: Counter[str] = Counter()
-    sweep = read_sweep(scan, LidarModel(range_sigma=0.01), drops, Counter())
+    sweep = read_sweep(scan, lidar, drops, Counter())
     assert sweep is not None
     assert not drops
     return sweep
@@ -141,8 +141,8 @@ def test_times_of_beams_go_with_time_increment() -> None:
 def test_a_lidar_upside_down_sees_mirrored() -> None:
     scan = changed([1.0, 2.0, 3.0], angle_increment=0.5)
     upright, mounted = LidarModel(yaw=0.3, x=0.1), LidarModel(yaw=0.3, x=0.1, roll=math.pi)
-    mirrored = swept(scan._replace(angle_increment=-0.5)).ends(upright, np.zeros((3, 3)))
-    assert swept(scan).ends(mounted, np.zeros((3, 3))) == pytest.approx(mirrored)
+    mirrored = swept(scan._replace(angle_increment=-0.5), upright).ends(np.zeros((3, 3)))
+    assert swept(scan, mounted).ends(np.zeros((3, 3))) == pytest.approx(mirrored)
 
 
 def test_scans_without_odometry_do_not_wait_for_ever() -> None:

@@ -29,6 +29,7 @@ from swarm_loc_estimator.mapping.messages import (
     learned_delay,
 )
 from swarm_loc_estimator.sensors.inputs import Ingest, input_topics
+from swarm_loc_estimator.swarm.error_models import SingleLidar
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimate import Contradicted
@@ -66,6 +67,8 @@ def sent(
     kind: type[LidarRobot] = LidarRobot,
     late_ns: int = 0,
     change: Callable[[ScanMessage], ScanMessage] = lambda scan: scan,
+    topic: str = "scan",
+    lidar: SingleLidar = LIDAR,
 ) -> list[tuple[str, int, bytes]]:
     """Topic, arrival and bytes: odometry, and each sweep when it is over, with some beams at people."""
     robot = kind(np.random.default_rng(seed))
@@ -74,11 +77,11 @@ def sent(
         data = odometry_bytes("a", at_ns, robot.odometry(np.array([at_ns])))
         found.append(("a/odom", at_ns, data))
     for k, at_ns in enumerate(range(0, until_ns - SWEEP_NS + 1, SWEEP_NS)):
-        scan = robot.scan(at_ns)
+        scan = robot.scan(at_ns, lidar)
         beams = np.arange(7 * k, 7 * k + blocked) % len(scan.ranges)
         scan.ranges[beams] = np.minimum(scan.ranges[beams], 0.5)
         scan = scan._replace(stamp_ns=at_ns + late_ns)
-        found.append(("a/scan", at_ns + late_ns + SWEEP_NS, scan_bytes(change(scan))))
+        found.append((f"a/{topic}", at_ns + late_ns + SWEEP_NS, scan_bytes(change(scan))))
     return sorted(found, key=lambda one: one[1])
 
 
@@ -133,6 +136,54 @@ def test_scans_that_are_stamped_late_are_named_and_poses_are_right(
         assert said is not None
         assert float(said[1]) == pytest.approx(-late_s, abs=0.04)
     assert np.mean(squares) < 4.5
+
+
+REAR = {"x": -0.1, "y": 0.05, "yaw": -0.5 * math.pi}
+TWO_LIDARS = replace(LIDAR, others={"scan_rear": REAR})
+
+
+def half(scan: ScanMessage) -> ScanMessage:
+    """The first half of the beams."""
+    return scan._replace(ranges=scan.ranges[: BEAMS // 2])
+
+
+def sent_by_two(until_ns: int, seed: int, late_ns: int = 0) -> list[tuple[str, int, bytes]]:
+    """Odometry, and the sweeps of two lidars that see one side each, at the same time; one may be late."""
+    front = sent(until_ns, seed, kind=Weaver, change=half)
+    lidar = TWO_LIDARS.all["scan_rear"]
+    rear = sent(until_ns, seed + 50, 0, Weaver, late_ns, half, "scan_rear", lidar)
+    both = sorted(front + [one for one in rear if one[0] != "a/odom"], key=lambda one: one[1])
+    return [one for one in both if one[1] <= until_ns]
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_two_lidars_with_a_half_each_locate_a_robot(room: Path, late_s: float) -> None:
+    """Either alone has the delay that it is named with."""
+    until_ns, squares = 6_000_000_000, []
+    for seed in range(4):
+        start = LidarRobot.start + np.random.default_rng(seed).standard_normal(3) * 0.05
+        robot = replace(swarm_at(room, start).robots[0], lidar=TWO_LIDARS)
+        estimator = Estimator(Swarm((robot,), map=room))
+        estimate = hand_in(estimator, sent_by_two(until_ns, seed, round(1e9 * late_s)))[-1]
+        error = wrapped(estimate.poses[0] - Weaver().pose(until_ns))
+        squares.append(float(nees(error[None], estimate.covariances)[0]))
+        assert estimate.status[0] == Status.TRACKED
+        assert estimator.used >= 50
+        said = [one.text for one in estimator.contradictions(until_ns)]
+        assert len(said) == (late_s > 0.0)
+        for text in said:
+            found = re.search(r"scans of a/scan_rear .* set lidar.others.scan_rear.delay_s to (\S+),", text)
+            assert found is not None
+            assert float(found[1]) == pytest.approx(-late_s, abs=0.04)
+    assert np.mean(squares) < 4.5
+
+
+def test_a_lost_robot_is_found_by_two_lidars_with_a_half_each(room: Path) -> None:
+    robot = Robot("a", lidar=TWO_LIDARS)
+    estimator, until_ns = Estimator(Swarm((robot,), map=room)), 12_000_000_000
+    estimate = hand_in(estimator, sent_by_two(until_ns, seed=1))[-1]
+    assert estimate.status[0] == Status.TRACKED
+    assert np.abs(wrapped(estimate.poses[0] - Weaver().pose(until_ns))).max() < CELL
 
 
 def test_a_pause_of_odometry_loses_no_robot_that_is_where_it_then_reports(room: Path) -> None:

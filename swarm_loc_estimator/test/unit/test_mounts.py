@@ -57,6 +57,20 @@ def test_the_first_transform_to_a_frame_counts() -> None:
     assert mounts.described().robots[0].lidar.x == 0.1
 
 
+def test_each_lidar_of_a_robot_has_its_own_mount() -> None:
+    robot = Robot("a", lidar=LidarModel(range_sigma=0.01, others={"rear": {"x": -0.1}}))
+    joints = [
+        ("base_link", "laser", (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ("base_link", "rear_laser", (-0.4, 0.2, 0.0), (math.pi, 0.0, 0.0)),
+    ]
+    mounts = mounts_of(robot, {"scan": "laser", "rear": "rear_laser"}, static(*joints))
+    first, rear = mounts.described().robots[0].lidar.all.values()
+    assert (first.x, first.y, first.yaw) == (0.3, 0.0, 0.0)
+    assert (rear.x, rear.y, rear.yaw) == pytest.approx((-0.1, 0.2, math.pi))
+    assert [(one.key, one.described) for one in mounts.differences()] == [("lidar.others.rear.x", -0.1)]
+    assert any("others.rear.yaw 3.142" in remark for remark in mounts.remarks())
+
+
 def test_the_description_wins_number_by_number_and_differences_are_named() -> None:
     robot = Robot("a", lidar=LidarModel(range_sigma=0.01, x=0.2), said=frozenset({"lidar.yaw"}))
     message = static(("base_link", "laser", (0.1, 0.3, 0.0), (TURN, 0.0, 0.0)))

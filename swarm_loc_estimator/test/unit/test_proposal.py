@@ -191,7 +191,7 @@ def test_what_nothing_shows_is_asked(tmp_path: Path) -> None:
 
 
 def test_mounts_are_those_of_static_transforms(tmp_path: Path) -> None:
-    """One robot without a namespace, whose lidar is turned by a quarter, and a map beside the bag."""
+    """One robot without a namespace, one of whose lidars is turned by a quarter, and a map beside the bag."""
     scan = {
         "angle_min": -3.0,
         "angle_max": 3.0,
@@ -201,23 +201,36 @@ def test_mounts_are_those_of_static_transforms(tmp_path: Path) -> None:
     }
     joint = {"translation": {"x": 0.1}, "rotation": {"z": np.sqrt(0.5), "w": np.sqrt(0.5)}}
     parent = {"frame_id": "base_link"}
-    static = {"transforms": [{"header": parent, "child_frame_id": "rplidar_link", "transform": joint}]}
+    joints = {"rplidar_link": joint, "rear_link": {"translation": {"x": -0.2}, "rotation": {"w": 1.0}}}
+    static = {
+        "transforms": [
+            {"header": parent, "child_frame_id": child, "transform": one} for child, one in joints.items()
+        ]
+    }
+    scans = {"scan": "rplidar_link", "scan_filtered": "rplidar_link", "scan_rear": "rear_link"}
     (tmp_path / "floor.yaml").write_text("image: floor.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with BagWriter(tmp_path / "bag") as writer:
-        for name, kind in (("odom", ODOMETRY), ("scan", LASER_SCAN), ("tf_static", TRANSFORMS)):
+        kinds = {"odom": ODOMETRY, "tf_static": TRANSFORMS, **dict.fromkeys(scans, LASER_SCAN)}
+        for name, kind in kinds.items():
             writer.add_topic(name, kind)
         writer.write("tf_static", 1_000_000_000_000, encode(static, TRANSFORMS))
         for k in range(50):
             at_ns = 1_000_000_000_000 + k * 100_000_000
             writer.write("odom", at_ns, odometry_bytes("robot", at_ns, frame="odom"))
-            header = {"frame_id": "rplidar_link", "stamp": at_ns}
-            writer.write("scan", at_ns, encode({**scan, "header": header}, LASER_SCAN))
-    swarm = proposal(tmp_path / "bag").swarm
+            for name, frame in scans.items():
+                header = {"frame_id": frame, "stamp": at_ns}
+                writer.write(name, at_ns, encode({**scan, "header": header}, LASER_SCAN))
+    found = proposal(tmp_path / "bag")
+    swarm = found.swarm
     (robot,) = swarm.robots
     assert robot.type == "turtlebot4"
-    assert swarm.topics == {"robot/odom": "odom", "robot/scan": "scan"}
+    own = ("odom", "scan", "scan_rear")
+    assert swarm.topics == {f"robot/{topic}": topic for topic in own}
+    assert any("has scans on scan, scan_rear. Remove" in line for line in found.asked)
     assert robot.lidar.is_used
     assert (robot.lidar.x, robot.lidar.yaw) == pytest.approx((0.1, np.pi / 2))
+    rear = robot.lidar.all["scan_rear"]
+    assert (rear.x, rear.yaw) == pytest.approx((-0.2, 0.0))
     assert swarm.map == tmp_path / "floor.yaml"
 
 

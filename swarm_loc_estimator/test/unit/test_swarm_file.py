@@ -2,6 +2,7 @@
 
 import math
 import string
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from swarm_loc_estimator.swarm import ir_board
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
+    LidarModel,
     MotionResponse,
     OdometryModel,
     RandomWalk,
     SensorModel,
+    SingleLidar,
 )
 from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import (
@@ -199,6 +202,21 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
         ("fileversion: 1", "fileversion: true", "fileversion is True but must be 1."),
         ("fileversion: 1\n", "", "fileversion is None but must be 1."),
         ("camera: {x: 0.01}", "camera: 3", "defaults.camera is 3 but must be a mapping of keys to values."),
+        (
+            "camera: {x: 0.01}",
+            "lidar: {others: {a b: {x: 1}}}",
+            "a name in defaults.lidar.others is 'a b' but must be a topic of the robot, such as scan_rear.",
+        ),
+        (
+            "camera: {x: 0.01}",
+            "lidar: {others: {rear: {z: 1}}}",
+            "'defaults.lidar.others.rear.z' is not a known key; the nearest one is 'yaw'.",
+        ),
+        (
+            "camera: {x: 0.01}",
+            "lidar: {others: {rear: {x: 11}}}",
+            "defaults.lidar.others.rear.x is 11 but must lie in [-10, 10] m.",
+        ),
     ],
 )
 def test_one_sentence_names_key_value_and_range(tmp_path: Path, old: str, new: str, sentence: str) -> None:
@@ -560,7 +578,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
     names = draw(
         st.lists(
             st.text(string.ascii_letters, min_size=1, max_size=6).filter(lambda n: n not in RESERVED_NAMES),
-            unique=True,
+            unique_by=str.lower,
             min_size=1,
             max_size=4,
         )
@@ -568,6 +586,8 @@ def swarms(draw: st.DrawFn) -> Swarm:
     robots: list[Robot] = []
     kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, ClockModel, StartSigma)
     pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
+    others = draw(st.dictionaries(st.sampled_from(["rear", "scan/left"]), numbers(SingleLidar)))
+    pool[LidarModel] = [LidarModel(), replace(draw(build(LidarModel)), others=others)]
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
         faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
@@ -579,6 +599,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
                 odometry=OdometryModel() if stands else draw(st.sampled_from(pool[OdometryModel])),
                 response=draw(st.sampled_from([None, RESPONSE])),
                 camera=draw(st.sampled_from([*pool[CameraMount], None])),
+                lidar=draw(st.sampled_from(pool[LidarModel])),
                 sensor=draw(st.sampled_from(pool[SensorModel])),
                 faces=faces[: draw(st.integers(0, 3))],
                 start=draw(

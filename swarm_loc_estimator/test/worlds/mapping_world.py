@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.se2 import compose, exp, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.mapping.scans import Readings
-from swarm_loc_estimator.swarm.error_models import LidarModel
+from swarm_loc_estimator.swarm.error_models import LidarModel, SingleLidar
 
 PERIOD_NS = 20_000_000
 MAX_RANGE = 2.5
@@ -121,8 +121,10 @@ class RoomRobot:
         return Readings(stamps, reported, inverse, SIGMA)
 
 
-LIDAR = LidarModel(range_sigma=0.01, range_sigma_per_m=0.01, x=0.05, y=-0.02, yaw=0.5 * math.pi)
-"""Of `LidarRobot`, on a mount off the centre."""
+LIDAR = LidarModel(
+    range_sigma=0.01, range_sigma_per_m=0.01, x=0.05, y=-0.02, yaw=0.5 * math.pi, map_sigma=0.02
+)
+"""Of `LidarRobot`, on a mount off the centre, in exact maps."""
 SWEEP_NS, BEAMS = 200_000_000, 360
 
 
@@ -143,17 +145,17 @@ class LidarRobot:
         """The true pose (3,)."""
         return compose(self.start, self.odometry(np.array([stamp_ns]))[0])
 
-    def scan(self, stamp_ns: int) -> ScanMessage:
+    def scan(self, stamp_ns: int, lidar: SingleLidar = LIDAR) -> ScanMessage:
         """The sweep that begins at a time; every beam leaves from where the robot then is."""
         beam_ns = stamp_ns + SWEEP_NS // BEAMS * np.arange(BEAMS)
         step = 2.0 * math.pi / BEAMS
         beams = np.stack([np.zeros(BEAMS), np.zeros(BEAMS), step * np.arange(BEAMS)], axis=-1)
-        mounted = compose(compose(self.start, self.odometry(beam_ns)), [LIDAR.x, LIDAR.y, LIDAR.yaw])
+        mounted = compose(compose(self.start, self.odometry(beam_ns)), [lidar.x, lidar.y, lidar.yaw])
         ranges = np.array(
             [distance_in_room(*ray, has_niche=self.has_niche) for ray in compose(mounted, beams).tolist()]
         )
         if self._rng is not None:
-            sigma = LIDAR.range_sigma + LIDAR.range_sigma_per_m * ranges
+            sigma = lidar.range_sigma + lidar.range_sigma_per_m * ranges
             ranges += sigma * self._rng.standard_normal(BEAMS)
         return ScanMessage(stamp_ns, 0.0, 2.0 * math.pi, step, SWEEP_NS // BEAMS * 1e-9, 0.12, 3.5, ranges)
 
@@ -161,7 +163,7 @@ class LidarRobot:
 def scan_bytes(scan: ScanMessage) -> bytes:
     header = {"stamp": scan.stamp_ns, "frame_id": scan.frame_id or "a/base_scan"}
     fields = {**scan._asdict(), "header": header, "ranges": scan.ranges.astype(np.float32)}
-    del fields["stamp_ns"], fields["frame_id"]
+    del fields["stamp_ns"], fields["frame_id"], fields["lidar"]
     return encode(fields, LASER_SCAN)
 
 

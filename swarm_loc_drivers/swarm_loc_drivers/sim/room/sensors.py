@@ -39,6 +39,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_pose_stamped,
     position_and_quaternion,
 )
+from swarm_loc_estimator.swarm.error_models import SingleLidar
 from swarm_loc_estimator.swarm.swarm import BODY, BODY_TOPIC, Anchor, Face, FixedCamera, UwbDevice
 
 Message = tuple[str, bytes]  # Topic, serialized message
@@ -139,51 +140,58 @@ class Lidar(SimulatedSensor):
     _BEAMS, _MOUNT = 360, (-0.04, 0.0, 0.5 * math.pi)
 
     def _prepared(self) -> list[str]:
-        swarm = self._world.swarm
-        self._robots = [k for k, robot in enumerate(swarm.robots) if robot.lidar.is_used]
-        keys = {f"lidar.{key}" for key in ("x", "y", "yaw")}
-        said = [
-            (one.lidar.x, one.lidar.y, one.lidar.yaw) if keys & one.said else None for one in swarm.robots
-        ]
-        self._mounts = np.array([mount or self._MOUNT for mount in said])
-        self._before = self._world.poses
-        return [swarm.topic(swarm.robots[k].name, "scan") for k in self._robots]
+        swarm, keys = self._world.swarm, {f"lidar.{key}" for key in ("x", "y", "yaw")}
+        self._lidars: list[tuple[int, SingleLidar]] = []
+        self._frames, topics, mounts = [], [], []
+        for k, robot in enumerate(swarm.robots):
+            for topic, lidar in robot.lidar.all.items() if robot.lidar.is_used else ():
+                is_first = lidar is robot.lidar
+                self._lidars.append((k, lidar))
+                self._frames.append(f"{robot.name}/{'laser' if is_first else topic}")
+                topics.append(swarm.topic(robot.name, topic))
+                is_unknown = is_first and not keys & robot.said
+                mounts.append(self._MOUNT if is_unknown else (lidar.x, lidar.y, lidar.yaw))
+        self._mounts = np.array(mounts).reshape(-1, 3)
+        self._track = [self._world.poses]  # Of each step of the sweep
+        return topics
+
+    def messages(self) -> Iterator[tuple[int, Message]]:
+        """As of each sensor; beams are measured where the robot is at each step."""
+        self._track.append(self._world.poses)
+        yield from super().messages()
 
     def transforms(self) -> bytes:
         """The tf2_msgs/TFMessage of all mounts."""
-        rows = position_and_quaternion(self._mounts[self._robots]).tolist()
-        names = [self._world.swarm.robots[k].name for k in self._robots]
+        rows = position_and_quaternion(self._mounts).tolist()
         found = [
             {
-                "header": {"stamp": self._world.now_ns, "frame_id": f"{name}/base_link"},
-                "child_frame_id": f"{name}/laser",
+                "header": {"stamp": self._world.now_ns, "frame_id": f"{frame.partition('/')[0]}/base_link"},
+                "child_frame_id": frame,
                 "transform": {
                     "translation": dict(zip("xyz", row[:3], strict=True)),
                     "rotation": dict(zip("xyzw", row[3:], strict=True)),
                 },
             }
-            for name, row in zip(names, rows, strict=True)
+            for frame, row in zip(self._frames, rows, strict=True)
         ]
         return encode({"transforms": found}, TRANSFORMS)
 
     def _measure(self) -> Iterator[Message]:
-        world, step = self._world, 2.0 * math.pi / self._BEAMS
-        share, angles = np.arange(self._BEAMS) / self._BEAMS, -math.pi + step * np.arange(self._BEAMS)
-        before, self._before = self._before, world.poses
-        motion = se2.log(se2.between(before, world.poses))
-        for topic, k in zip(self.topics, self._robots, strict=True):
-            poses = se2.compose(before[k], se2.exp(share[:, None] * motion[k]))
+        world, step, share = self._world, 2.0 * math.pi / self._BEAMS, np.arange(self._BEAMS) / self._BEAMS
+        track, self._track = np.unwrap(self._track, axis=0), self._track[-1:]
+        steps, angles = np.arange(len(track)), 2.0 * math.pi * share - math.pi
+        rows = zip(self.topics, self._lidars, self._mounts, self._frames, strict=True)
+        for topic, (k, lidar), mount, frame in rows:
+            poses = np.stack([np.interp(share * steps[-1], steps, one) for one in track[:, k].T], axis=-1)
             others = np.delete(world.poses[:, :2], k, axis=0)
-            beams = se2.compose(poses, self._mounts[k])
+            rays = se2.compose(poses, mount)
             radius = float(world.radii.max())
-            ranges = cast(world.walls, others, radius, beams[:, :2], beams[:, 2] + angles)
-            lidar = world.swarm.robots[k].lidar
+            ranges = cast(world.walls, others, radius, rays[:, :2], rays[:, 2] + angles)
             sigma = lidar.range_sigma + lidar.range_sigma_per_m * np.where(np.isfinite(ranges), ranges, 0.0)
             ranges = ranges + sigma * self._rng.standard_normal(self._BEAMS)
             ranges[ranges > lidar.max_range] = math.inf
-            name, stamp_ns = world.swarm.robots[k].name, world.now_ns - self._period_ns
             fields = {
-                "header": {"stamp": stamp_ns, "frame_id": f"{name}/laser"},
+                "header": {"stamp": world.now_ns - self._period_ns, "frame_id": frame},
                 "angle_min": -math.pi,
                 "angle_max": math.pi - step,
                 "angle_increment": step,
