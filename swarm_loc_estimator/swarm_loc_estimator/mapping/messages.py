@@ -125,9 +125,9 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers = [float(getattr(message, name)) for name in ScanMessage._fields[1:-3]]
+    numbers: dict[str, Any] = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-3]}
     header, ranges = message.header, message.ranges.astype(float)
-    return ScanMessage(nanoseconds(header.stamp), *numbers, ranges, header.frame_id)
+    return ScanMessage(nanoseconds(header.stamp), **numbers, ranges=ranges, frame_id=header.frame_id)
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
