@@ -587,7 +587,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
     kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, ClockModel, StartSigma)
     pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
     others = draw(st.dictionaries(st.sampled_from(["rear", "scan/left"]), numbers(SingleLidar)))
-    pool[LidarModel] = [LidarModel(), replace(draw(build(LidarModel)), others=others)]
+    lidars = [LidarModel(), replace(draw(build(LidarModel)), others=others)]
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
         faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
@@ -599,7 +599,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
                 odometry=OdometryModel() if stands else draw(st.sampled_from(pool[OdometryModel])),
                 response=draw(st.sampled_from([None, RESPONSE])),
                 camera=draw(st.sampled_from([*pool[CameraMount], None])),
-                lidar=draw(st.sampled_from(pool[LidarModel])),
+                lidar=draw(st.sampled_from(lidars)),
                 sensor=draw(st.sampled_from(pool[SensorModel])),
                 faces=faces[: draw(st.integers(0, 3))],
                 start=draw(
