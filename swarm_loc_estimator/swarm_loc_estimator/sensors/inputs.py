@@ -37,11 +37,11 @@ from swarm_loc_estimator.sensors.sensor import (
     VALID,
     Accumulator,
     DropCounts,
-    Guard,
     InputKind,
     Known,
     Sensor,
     SensorSettings,
+    guarded,
     in_order_of_arrival,
     is_about_swarm,
     reject_reasons,
@@ -310,7 +310,7 @@ class InputConverter:
             if late.any():
                 self.drops.add("future_stamp", rows.robot[late])
                 rows = select(rows, ~late)
-            with Guard(name, rows.robot.size, self.drops.total):
+            with guarded(name, rows.robot.size, self.drops.total):
                 found = self._sensors[name].measure(rows)
                 is_measured = sensor.accumulator is None and sensor.unit is not None
                 kept[name] = self._valid(found) if is_measured else found
@@ -493,7 +493,7 @@ class Ingest:
             if not present[number]:
                 continue
             part = batch if present[number] == batch.size else batch.chosen(of_message == number)
-            with Guard(kind.name, part.size, dropped):
+            with guarded(kind.name, part.size, dropped):
                 found = reader.read(part)
                 robot, corrects = self._robot[part.topic], self._corrects_clocks and not kind.in_map
                 stamp_ns = found.stamp_ns - self._clock_offset_ns[robot] if corrects else found.stamp_ns

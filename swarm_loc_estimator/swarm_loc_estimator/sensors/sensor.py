@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
@@ -107,25 +108,19 @@ class DropCounts:
         return good
 
 
-class Guard:
+@contextmanager
+def guarded(sensor: str, readings: int, drops: Counter[str]) -> Iterator[None]:
     """A context in which an error of a sensor's code costs the readings of this sensor and no others.
 
     They are counted by the name of the sensor and the type of the error, which a warning describes.
     """
-
-    def __init__(self, sensor: str, readings: int, drops: Counter[str]) -> None:
-        self._sensor, self._readings, self._drops = sensor, readings, drops
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
-        if kind is None or not isinstance(error, Exception):
-            return False
-        self._drops[f"{self._sensor}_{kind.__name__}"] += self._readings
-        said = f"the code of the sensor '{self._sensor}' raised {kind.__name__}: {error}"
-        warnings.warn(said, RuntimeWarning, stacklevel=2)
-        return True
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - whatever code of others raises
+        kind = type(error).__name__
+        drops[f"{sensor}_{kind}"] += readings
+        said = f"the code of the sensor '{sensor}' raised {kind}: {error}"
+        warnings.warn(said, RuntimeWarning, stacklevel=3)
 
 
 @dataclass(frozen=True)

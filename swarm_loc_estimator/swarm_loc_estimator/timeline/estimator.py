@@ -31,7 +31,7 @@ from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
 from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
-from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, Guard, reject_reasons
+from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, guarded, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline import local_origin
 from swarm_loc_estimator.timeline.estimate import (
@@ -179,7 +179,7 @@ class Estimator:
                     self.use_map(arrival_ns, drawn)
             else:
                 accumulator = self._gathering[name] = self._converter.accumulators[name]
-                with Guard(name, rows.robot.size, self._converter.drops.total):
+                with guarded(name, rows.robot.size, self._converter.drops.total):
                     change = accumulator.take(rows)
                     self._timeline.add(change.added)
                     self._timeline.withdraw(change.withdrawn)
