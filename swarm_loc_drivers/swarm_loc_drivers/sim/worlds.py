@@ -80,11 +80,11 @@ def hidden_geometry(rng: np.random.Generator, swarm: Swarm, errors: ErrorModel) 
     mounts = np.array([[r.camera.x, r.camera.y, r.camera.yaw] for r in swarm.robots if r.camera is not None])
     mounts[:, 2] += errors.camera_yaw_sigma * rng.standard_normal(len(mounts))
     scales = 1.0 + errors.scale_sigma * rng.standard_normal(len(mounts))
-    landmarks = np.array([[m.x, m.y, m.yaw] for m in swarm.landmarks], dtype=float)
+    landmarks = np.array([[m.x, m.y, m.yaw] for m in swarm.landmarks], dtype=float).reshape(-1, 3)
     spread = np.array([errors.map_position_sigma, errors.map_position_sigma, errors.map_heading_sigma])
     landmarks += spread * rng.standard_normal(landmarks.shape)
     all_faces = [(index, face) for index, robot in enumerate(swarm.robots) for face in robot.faces]
-    faces = np.array([[face.x, face.y, face.yaw] for _, face in all_faces], dtype=float)
+    faces = np.array([[face.x, face.y, face.yaw] for _, face in all_faces], dtype=float).reshape(-1, 3)
     faces[:, :2] += errors.face_position_sigma * rng.standard_normal((len(faces), 2))
     owner = np.array([index for index, _ in all_faces], dtype=np.int64)
     ids = [mark.id for mark in swarm.landmarks] + [face.id for _, face in all_faces]

@@ -63,6 +63,17 @@ def test_ideal_wheels_drive_the_arc_that_their_counters_tell(left: float, right:
     np.testing.assert_array_equal(world.poses[1:], START[1:])
 
 
+@pytest.mark.parametrize("shown", ["faces", "landmarks", "nothing"])
+def test_swarms_with_markers_on_robots_alone_in_the_room_alone_or_nowhere_are_simulated(shown: str) -> None:
+    swarm = describe(EightSettings(robots=len(START)), START)
+    swarm = replace(swarm, landmarks=swarm.landmarks if shown == "landmarks" else ())
+    robots = tuple(replace(one, faces=one.faces if shown == "faces" else ()) for one in swarm.robots)
+    world = world_of(W2, swarm=replace(swarm, robots=robots))
+    taken = run(world, 0.5)
+    assert {one.robot for one in taken} == {0, 1, 2}
+    assert all(world.image(one).std() > 0.0 for one in taken[-3:])
+
+
 def test_counters_are_blind_to_slip_and_noise() -> None:
     turns = []
     for seed in range(40):
