@@ -339,7 +339,8 @@ def _goes_through(walls: WallMap, from_x: float, from_y: float, x: float, y: flo
 
 _SYSTEMATIC_SHARE = 0.7
 """Share of a match's variance that the next scans have, too: what is wrong with the map at a place."""
-_ALIKE_M = 2.0  # Distance within which errors of a map are alike [m]
+_ALIKE_M, _ROUGH_M = 2.0, 0.02
+"""Distance within which errors of a map are alike, and their part that is not alike from scan to scan [m]."""
 _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 """Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
 ALL, SURE_FIT = 3, 0.65
@@ -432,7 +433,10 @@ class MapScans:
             if delay.stamp_ns > 0:
                 best = int(delay.chance.argmax())
                 driven = math.dist(delay.track[best, :2], track[best, :2])
-            delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
+            # of the errors of the map, scans share those that are alike where both were
+            own = min(1.0, (state.map.walls.variance + _ROUGH_M**2) / walls.variance)
+            own += (1.0 - own) * min(1.0, driven / _ALIKE_M)
+            delay = learned_delay(delay, stamp_ns, compose(found.pose, back), own * found.covariance, track)
             delay = state.delays[lidar] = delay._replace(anchor=anchor)
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
