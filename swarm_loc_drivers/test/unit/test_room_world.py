@@ -126,7 +126,7 @@ def test_a_sweep_of_a_robot_that_stands_shows_walls_and_the_other_robot() -> Non
     scans = {topic: decode_scan(data) for _, (topic, data) in lidar.messages()}
     assert [*scans] == ["a/scan", "a/scan_rear", "b/scan", "b/scan_rear"]
     scan, rear = scans["a/scan"], scans["a/scan_rear"]
-    assert (scan.frame_id, rear.frame_id) == ("a/laser", "a/scan_rear")
+    assert (scan.frame_id, rear.frame_id) == ("a/laser", "a/scan_rear_laser")
     assert np.roll(rear.ranges, 180) == pytest.approx(scan.ranges, abs=0.05)
     assert scan.ranges[180] == pytest.approx(0.5 - world.radii[1], abs=0.03)  # ahead
     assert scan.ranges[0] == pytest.approx(1.2, abs=0.05)  # behind

@@ -50,6 +50,9 @@ _BACKWARDS, _SURE_ORDER = -2.0, 4.0
 _NEAR_S, _REFUTED, _LASTS_NS = 0.06, 0.05, 3_000_000_000
 """A delay is refuted if it, and those so near, have had less chance than this for so long."""
 _LIKELY = 2**62  # Stamp of what has not happened [ns]
+_DOUBTED, _EXCLUDED, _PARDON = 1.0, 10.0, 0.25
+"""Numbers of scans that contradict another lidar of the robot from which one is doubted, and is not used any
+more, and by how much a scan that agrees lowers its number."""
 _NOWHERE = np.full((3, 3), np.nan)
 
 
@@ -263,8 +266,30 @@ class DelayBelief(NamedTuple):
     backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
     noise: float = 1.0  # Mean of recent squares: how much worse odometry is than assumed
     unlikely_ns: int = _LIKELY  # Stamp since when the described delay has hardly any chance
+    fit_ns: int = -_LIKELY  # Stamp of the newest scan that fit where its robot was
+    misses: float = 0.0  # Score of scans that contradict another lidar of the robot
     #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
     anchor: FloatArray = _NOWHERE
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the lidar contradicts another one of its robot and may be right: it had not agreed."""
+        return self.misses >= _DOUBTED and (self.misses < _EXCLUDED or self.fit_ns < 0)
+
+    @property
+    def is_excluded(self) -> bool:
+        """Whether the lidar contradicts another one of its robot again and again."""
+        return self.misses >= _EXCLUDED
+
+    def elsewhere(self) -> DelayBelief:
+        """The belief after the robot was found elsewhere; a lidar that is excluded stays so."""
+        return self if self.is_excluded else self._replace(fit_ns=-_LIKELY, misses=0.0)
+
+    def judged(self, stamp_ns: int, *, fits: bool) -> DelayBelief:
+        """The belief after a scan that fits where its robot is, or contradicts another lidar there."""
+        if fits:
+            return self._replace(fit_ns=stamp_ns, misses=max(0.0, self.misses - _PARDON))
+        return self._replace(misses=min(self.misses + 1.0, 2.0 * _EXCLUDED))
 
     @property
     def is_backwards(self) -> bool:

@@ -248,7 +248,7 @@ class Diagnostics:
     def _values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, object]:
         """Figures of an input over the interval; begins its next one."""
         statistics = self._ingest.statistics[handle]
-        name = topic.name if topic.kind.of_pairs else topic.kind.topic
+        name = topic.name if topic.kind.of_pairs or topic.device else topic.kind.topic
         arrived = statistics.received - self._received[handle]
         self._received[handle] = statistics.received
         arrival_ns, count, most_ns = statistics.last_arrival_ns, statistics.late_count, statistics.late_max_ns

@@ -116,7 +116,10 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     """
     each = [kind for kind in kinds().values() if kind.of_each]
     known = {TRUTH, *(kind.topic for kind in each)}
-    known |= {topic for kind in each for robot in swarm.robots for topic in kind.topics_of(robot)}
+    further = {topic for robot in swarm.robots for kind in each for topic in kind.topics_of(robot)[1:]}
+    if taken := sorted(further & {*known, "pose"}):
+        raise UserError(f"lidar.others has {taken[0]}, but that is another topic of the robot.")
+    known |= further
     if unknown := [key for key in swarm.topics if key.partition("/")[2] not in known]:
         raise UserError(f"topics has {unknown[0]}, but topics of robots are {', '.join(sorted(known))}.")
     of_robots = (

@@ -159,12 +159,15 @@ class SingleLidar:
         return self.range_sigma > 0.0
 
 
+_LIDAR_TOPIC = r"[a-zA-Z_]\w*(/[a-zA-Z_]\w*)*"
+
+
 def _read_others(checks: TreeChecks, tree: Tree, key: str) -> dict[str, dict[str, float]]:
     """Read `LidarModel.others`."""
     lidars = checks.mapping(tree, key)
     for topic in lidars:
-        if not isinstance(topic, str) or not re.fullmatch(r"\w+(/\w+)*", topic):
-            raise checks.error(f"a name in {key}", topic, "must be a topic of the robot, such as scan_rear")
+        if not isinstance(topic, str) or not re.fullmatch(_LIDAR_TOPIC, topic, re.ASCII) or topic == "scan":
+            raise checks.error(f"a name in {key}", topic, "must be a topic but scan, such as scan_rear")
     specs = entry_specs(SingleLidar)
     return {topic: checks.values(values, f"{key}.{topic}", specs) for topic, values in lidars.items()}
 
@@ -181,12 +184,19 @@ _OTHERS = {
 
 @dataclass(frozen=True)
 class LidarModel(SingleLidar):
-    """The lidar of a robot, for mapping and for localization in a map, and others for localization."""
+    """The lidar of a robot, for mapping and for localization in a map, and others for localization.
+
+    Raises ValueError if there are others but no first one.
+    """
 
     #: Topic of another lidar -> its mount, and what else differs from this one
     others: Mapping[str, Mapping[str, float]] = field(
         default_factory=dict, metadata=entry(EntrySpec(_read_others, _OTHERS))
     )
+
+    def __post_init__(self) -> None:
+        if self.others and not self.is_used:
+            raise ValueError("range_sigma is 0 but must be greater, since there are others.")
 
     @property
     def all(self) -> dict[str, SingleLidar]:
@@ -194,12 +204,12 @@ class LidarModel(SingleLidar):
         common = {one.name: getattr(self, one.name) for one in fields(SingleLidar)}
         common |= dict.fromkeys(("x", "y", "yaw", "roll"), 0.0)
         others = {topic: SingleLidar(**{**common, **own}) for topic, own in self.others.items()}
-        return {"scan": self, **others}
+        return {"scan": self, **{topic: one for topic, one in others.items() if one.is_used}}
 
     @property
     def sees_robots(self) -> bool:
         """Whether it sees other robots, so that it is of use without a map, too."""
-        return self.is_used and self.robot_radius > 0.0
+        return self.is_used and any(one.robot_radius > 0.0 for one in self.all.values())
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,9 @@ class _Loader(TreeChecks):
         layers = [defaults, *([types[type_name]] if type_name else []), own]
         sections = {section: _merged(layers, section) for section in SECTIONS}
         models: Layer = {
-            section: None if (values := sections[section]) is None else cls(**values)
+            section: None
+            if (values := sections[section]) is None
+            else self.made(f"{key}.{section}.", cls, **values)
             for section, cls in MODELS.items()
         }
         start = mapping.get("start")

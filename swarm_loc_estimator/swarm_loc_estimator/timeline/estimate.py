@@ -8,6 +8,7 @@ from shared topics or dead encoders, by the poses of the robot, which move never
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
@@ -23,11 +24,12 @@ from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.filter.models import ANY_HEADING
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
+from swarm_loc_estimator.mapping.messages import DelayBelief
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import moved_place
-from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.self_calibration import estimated_place
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -289,13 +291,9 @@ def contradictions(
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
         *(
-            Contradiction(f"lidar of {names[k]}", Contradicted.LATE, one.sentence(swarm.robots[k], number))
-            for (k, number), one in state.delays.items()
-            if one.is_refuted
-        ),
-        *(
-            _of_robot(names[one], Contradicted.BACKWARDS)
-            for one in sorted({k for (k, _), delay in state.delays.items() if delay.is_backwards})
+            one
+            for k, number in sorted(state.delays)
+            for one in _lidar(swarm.robots[k], number, state.delays[k, number])
         ),
         *(
             one
@@ -316,18 +314,32 @@ _TEXTS = {
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
     Contradicted.REPEATED: "the radio of {0} repeats its values: they count once; publish each range once,"
     " with its stamp",
-    Contradicted.BACKWARDS: "the lidar of {0} measures its beams in the other order than its time_increment"
-    " says: using them so; let its driver publish a negative one, or reverse the ranges",
 }
 _PART = {
     Contradicted.GYROSCOPE: GYROSCOPE_OF,
     Contradicted.REPEATED: "radio of ",
-    Contradicted.BACKWARDS: "lidar of ",
 }
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
     return Contradiction(_PART.get(kind, "") + name, kind, _TEXTS[kind].format(name))
+
+
+def _lidar(robot: Robot, number: int, delay: DelayBelief) -> Iterator[Contradiction]:
+    """Faults of a lidar of a robot, by its number."""
+    topic = [*robot.lidar.all][number]
+    name = f"lidar {topic} of {robot.name}" if number else f"lidar of {robot.name}"
+    if delay.is_excluded:
+        mount = f"lidar.others.{topic}" if number else "lidar"
+        text = f"not using the {name} until it agrees with its other lidars again: check {mount}"
+        yield Contradiction(name, Contradicted.SUSPENDED, f"{text} (x, y, yaw, roll) and its driver")
+        return
+    if delay.is_refuted:
+        yield Contradiction(name, Contradicted.LATE, delay.sentence(robot, number))
+    if delay.is_backwards:
+        text = f"the {name} measures its beams in the other order than its time_increment says: using them so"
+        remedy = "let its driver publish a negative one, or reverse the ranges"
+        yield Contradiction(name, Contradicted.BACKWARDS, f"{text}; {remedy}")
 
 
 def _sightings(observer: str, source: str) -> Contradiction:

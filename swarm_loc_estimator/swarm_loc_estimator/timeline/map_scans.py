@@ -353,6 +353,7 @@ _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
+_BACKED_NS = 1_000_000_000  # How long another lidar's scan that fits speaks for the pose
 _GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
@@ -386,7 +387,9 @@ class MapScans:
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
         `sought`, see `MapSearch.around`, and returned. Once a scan contradicts its pose, the robot is not
-        tracked until one scan alone tells its place, or the motion between two scans agrees with odometry.
+        tracked until one scan alone tells its place, or the motion between two scans agrees with odometry. A
+        lidar that contradicts another one of its robot moves nothing, and is not used once it does so again
+        and again.
         Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
@@ -408,10 +411,23 @@ class MapScans:
             reversed_beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
             other = match(walls, *reversed_beams, pose, covariance)
             news = min(max(_ORDER_WEIGHT * (found.misfit - other.misfit), -_ORDER_NEWS), _ORDER_NEWS)
-            delay = delay._replace(backwards=delay.backwards + (news if is_open else 0.0))
+            is_clear = any(one.outcome == FITS and one.fitting >= SURE_FIT for one in (found, other))
+            delay = delay._replace(backwards=delay.backwards + (news if is_open and is_clear else 0.0))
             if delay.backwards > 0.0:
                 found, beams = other, reversed_beams
         state.delays[lidar] = delay
+        # Another lidar of the robot may have fit just now, which this one contradicts.
+        others = [one for key, one in state.delays.items() if key[0] == robot and key != lidar]
+        is_backed = any(stamp_ns - one.fit_ns < _BACKED_NS and not one.is_doubted for one in others)
+        if found.outcome == FITS and found.fitting >= SURE_FIT:
+            delay = state.delays[lidar] = delay.judged(stamp_ns, fits=True)
+        elif found.outcome in (OFF_MAP, FAR) and is_backed:
+            delay = state.delays[lidar] = delay.judged(stamp_ns, fits=False)
+            if delay.is_doubted:
+                state.sources.confirmations[robot] = min(state.sources.confirmations[robot], CONFIRMED)
+            return None, Verdict.OFF_MAP, False
+        if delay.is_excluded or (found.outcome == BLOCKED and is_backed):
+            return None, Verdict.BLOCKED if found.outcome == BLOCKED else Verdict.OFF_MAP, False
         # Odometry may have left out a motion, which it reports or not, or the pose was wrong before.
         anchor = np.stack([found.pose, now, self.tracks.at(np.array([robot]), np.array([stamp_ns])).raw[0]])
         reported, follows = self._left_out(delay, anchor, covariance)
@@ -421,12 +437,14 @@ class MapScans:
         confirmations = state.sources.confirmations[robot]
         confirmed, is_doubted = confirmations >= CONFIRMED, confirmations == CONFIRMED
         is_lost = is_known or not fits
-        if confirmed and (is_lost or is_doubted or found.outcome == FAR):
+        may_search = confirmed and (reported is not None or not is_backed)
+        if may_search and (is_lost or is_doubted or found.outcome == FAR):
             least = SURE_FIT if is_known or fits else max(SURE_FIT, found.fitting + DECLINE)
             place = sought(state.map._replace(walls=walls), *beams, pose, covariance, reported, least)
             if place is not None and (is_lost or place.is_certain):
                 anchor[0] = place.pose
-                state.delays[lidar] = delay._replace(anchor=anchor, stamp_ns=-1)
+                delay = delay._replace(anchor=anchor, stamp_ns=-1)
+                self.found_elsewhere(state, lidar, delay, stamp_ns)
                 return place, Verdict.USED, place.is_certain
         # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
@@ -457,7 +475,8 @@ class MapScans:
         # With a second solution it locates no robot alone: it was sought near the pose that may be wrong.
         fix.has_second[:], fix.second[:] = True, fix.value
         tells = (follows and found.determined >= ALL - 1) if is_doubted else found.determined == ALL
-        return fix, Verdict.OPEN, tells and found.fitting >= SURE_FIT
+        tells = tells and found.fitting >= SURE_FIT and not any(one.is_doubted for one in others)
+        return fix, Verdict.OPEN, tells
 
     def _left_out(
         self, delay: DelayBelief, anchor: FloatArray, covariance: FloatArray
@@ -478,6 +497,13 @@ class MapScans:
         has_left_out = is_unknown or (np.abs(moved - used) > slack).any()
         reported = compose(delay.anchor[0], moved) if has_left_out else None
         return reported, bool((np.abs(seen - used) < slack).all())
+
+    @staticmethod
+    def found_elsewhere(state: SwarmState, lidar: tuple[int, int], delay: DelayBelief, stamp_ns: int) -> None:
+        """Forget that other lidars of a robot agreed before it was found elsewhere by this one."""
+        for key in [key for key in state.delays if key[0] == lidar[0]]:
+            state.delays[key] = state.delays[key].elsewhere()
+        state.delays[lidar] = delay.elsewhere().judged(stamp_ns, fits=True)
 
     def sweep_of(self, one: Measurements) -> LidarSweep | None:
         """The sweep of a row of a scan; None: it is not kept any more."""

@@ -76,6 +76,7 @@ _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and tha
 _GRADES = 100  # Of nearness to a wall, at the first level
 _SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
+_SILENT_NS = 2_000_000_000  # Silence of a lidar after which another one of the robot searches
 
 
 class SearchMap(NamedTuple):
@@ -129,6 +130,8 @@ class PossiblePlaces(NamedTuple):
     search: PlaceSearch | None = None  # What is under way; no looks are added meanwhile
     is_complete: bool = False  # Whether a search by several looks has found all of these
     had_rivals: bool = False  # Whether it was ambiguous before the last look
+    lidar: int = 0  # Number of the lidar whose scans are these looks
+    scan_ns: int = 0  # Stamp of its newest scan
 
     @property
     def is_sole(self) -> bool:
@@ -195,10 +198,20 @@ class MapSearch:
             return None, Verdict.NOT_LOCALIZED
         before, walls = state.places.get(robot), scans.walls_for(sweep, state.map.walls)
         known = state.map._replace(walls=walls)
+        delay = state.delays.get((robot, sweep.number)) or described_delay(sweep.lidar.delay_s)
+        # the places are those of one lidar, while it sends scans and there are any
+        if before is not None and before.lidar != sweep.number:
+            is_under_way = before.search is not None or len(before.transform)
+            if is_under_way and stamp_ns - before.scan_ns < _SILENT_NS:
+                return None, _why_nowhere(before)
+            before = None
+        if delay.is_excluded:
+            return None, _why_nowhere(before)
+        if before is not None:
+            before = state.places[robot] = before._replace(scan_ns=stamp_ns)
         if before is not None and before.search is not None:
             state.places[robot] = places = self._advanced(before, before.search, known)
             return None, _why_nowhere(places)
-        delay = state.delays.get((robot, sweep.number)) or described_delay(sweep.lidar.delay_s)
         if scans.turned(robot, sweep) > _SEARCH_TURN:
             return None, _why_nowhere(before)  # its delay and order of beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
@@ -206,8 +219,9 @@ class MapSearch:
         places, found = self._add(before, stamp_ns, SweptBeams.thinned(*beams), now, known)
         if found is not None:
             state.places.pop(robot, None)
+            scans.found_elsewhere(state, (robot, sweep.number), delay, stamp_ns)
             return found, Verdict.USED
-        state.places[robot] = places
+        state.places[robot] = places._replace(lidar=sweep.number, scan_ns=stamp_ns)
         return None, _why_nowhere(places)
 
     @staticmethod

@@ -147,11 +147,13 @@ def half(scan: ScanMessage) -> ScanMessage:
     return scan._replace(ranges=scan.ranges[: BEAMS // 2])
 
 
-def sent_by_two(until_ns: int, seed: int, late_ns: int = 0) -> list[tuple[str, int, bytes]]:
+def sent_by_two(
+    until_ns: int, seed: int, late_ns: int = 0, rear_as: Callable[[ScanMessage], ScanMessage] = half
+) -> list[tuple[str, int, bytes]]:
     """Odometry, and the sweeps of two lidars that see one side each, at the same time; one may be late."""
     front = sent(until_ns, seed, kind=Weaver, change=half)
     lidar = TWO_LIDARS.all["scan_rear"]
-    rear = sent(until_ns, seed + 50, 0, Weaver, late_ns, half, "scan_rear", lidar)
+    rear = sent(until_ns, seed + 50, 0, Weaver, late_ns, rear_as, "scan_rear", lidar)
     both = sorted(front + [one for one in rear if one[0] != "a/odom"], key=lambda one: one[1])
     return [one for one in both if one[1] <= until_ns]
 
@@ -176,6 +178,29 @@ def test_two_lidars_with_a_half_each_locate_a_robot(room: Path, late_s: float) -
             assert found is not None
             assert float(found[1]) == pytest.approx(-late_s, abs=0.04)
     assert np.mean(squares) < 4.5
+
+
+@pytest.mark.parametrize("begin_ns", [0, 4 * SECOND])
+def test_a_lidar_that_contradicts_the_other_one_is_named_and_moves_nothing(room: Path, begin_ns: int) -> None:
+    """It is left out if it agreed before; else nobody knows which one is right, and the robot is not tracked."""
+
+    def turned(scan: ScanMessage) -> ScanMessage:
+        return half(scan)._replace(angle_min=2.0 if scan.stamp_ns >= begin_ns else scan.angle_min)
+
+    until_ns, squares = 12 * SECOND, []
+    for seed in range(3):
+        start = LidarRobot.start + np.random.default_rng(seed).standard_normal(3) * 0.05
+        robot = replace(swarm_at(room, start).robots[0], lidar=TWO_LIDARS)
+        estimator = Estimator(Swarm((robot,), map=room))
+        estimates = hand_in(estimator, sent_by_two(until_ns, seed, rear_as=turned))
+        for one in estimates[len(estimates) // 6 :]:
+            error = wrapped(one.poses[0] - Weaver().pose(one.stamp_ns))
+            squares.append(float(nees(error[None], one.covariances)[0]))
+        assert estimates[-1].status[0] == (Status.TRACKED if begin_ns else Status.UNCONFIRMED)
+        named = estimator.contradictions(until_ns)
+        assert [(one.about, one.kind) for one in named] == [("lidar scan_rear of a", Contradicted.SUSPENDED)]
+    assert np.mean(squares) < 4.5
+    assert max(squares) < 25.0
 
 
 def test_a_lost_robot_is_found_by_two_lidars_with_a_half_each(room: Path) -> None:

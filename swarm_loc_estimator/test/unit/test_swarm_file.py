@@ -205,12 +205,17 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
         (
             "camera: {x: 0.01}",
             "lidar: {others: {a b: {x: 1}}}",
-            "a name in defaults.lidar.others is 'a b' but must be a topic of the robot, such as scan_rear.",
+            "a name in defaults.lidar.others is 'a b' but must be a topic but scan, such as scan_rear.",
         ),
         (
             "camera: {x: 0.01}",
             "lidar: {others: {rear: {z: 1}}}",
             "'defaults.lidar.others.rear.z' is not a known key; the nearest one is 'yaw'.",
+        ),
+        (
+            "camera: {x: 0.01}",
+            "lidar: {others: {rear: {x: 1}}}",
+            "robots.one.lidar.range_sigma is 0 but must be greater, since there are others.",
         ),
         (
             "camera: {x: 0.01}",
@@ -587,7 +592,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
     kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, ClockModel, StartSigma)
     pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
     others = draw(st.dictionaries(st.sampled_from(["rear", "scan/left"]), numbers(SingleLidar)))
-    lidars = [LidarModel(), replace(draw(build(LidarModel)), others=others)]
+    lidars = [LidarModel(), replace(draw(build(LidarModel)), range_sigma=0.01, others=others)]
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
         faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))

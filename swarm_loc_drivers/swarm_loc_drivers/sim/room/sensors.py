@@ -147,7 +147,7 @@ class Lidar(SimulatedSensor):
             for topic, lidar in robot.lidar.all.items() if robot.lidar.is_used else ():
                 is_first = lidar is robot.lidar
                 self._lidars.append((k, lidar))
-                self._frames.append(f"{robot.name}/{'laser' if is_first else topic}")
+                self._frames.append(f"{robot.name}/{'laser' if is_first else f'{topic}_laser'}")
                 topics.append(swarm.topic(robot.name, topic))
                 is_unknown = is_first and not keys & robot.said
                 mounts.append(self._MOUNT if is_unknown else (lidar.x, lidar.y, lidar.yaw))
@@ -162,7 +162,9 @@ class Lidar(SimulatedSensor):
 
     def transforms(self) -> bytes:
         """The tf2_msgs/TFMessage of all mounts."""
-        rows = position_and_quaternion(self._mounts).tolist()
+        rows = position_and_quaternion(self._mounts)
+        rolls = Rotation.from_euler("X", [[lidar.roll] for _, lidar in self._lidars])
+        rows[:, 3:] = (Rotation.from_quat(rows[:, 3:]) * rolls).as_quat()
         found = [
             {
                 "header": {"stamp": self._world.now_ns, "frame_id": f"{frame.partition('/')[0]}/base_link"},
@@ -172,7 +174,7 @@ class Lidar(SimulatedSensor):
                     "rotation": dict(zip("xyzw", row[3:], strict=True)),
                 },
             }
-            for frame, row in zip(self._frames, rows, strict=True)
+            for frame, row in zip(self._frames, rows.tolist(), strict=True)
         ]
         return encode({"transforms": found}, TRANSFORMS)
 
@@ -186,7 +188,9 @@ class Lidar(SimulatedSensor):
             others = np.delete(world.poses[:, :2], k, axis=0)
             rays = se2.compose(poses, mount)
             radius = float(world.radii.max())
-            ranges = cast(world.walls, others, radius, rays[:, :2], rays[:, 2] + angles)
+            ranges = cast(
+                world.walls, others, radius, rays[:, :2], rays[:, 2] + math.cos(lidar.roll) * angles
+            )
             sigma = lidar.range_sigma + lidar.range_sigma_per_m * np.where(np.isfinite(ranges), ranges, 0.0)
             ranges = ranges + sigma * self._rng.standard_normal(self._BEAMS)
             ranges[ranges > lidar.max_range] = math.inf
