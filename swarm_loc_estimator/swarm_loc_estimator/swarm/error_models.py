@@ -167,7 +167,7 @@ def _read_others(checks: TreeChecks, tree: Tree, key: str) -> dict[str, dict[str
     lidars = checks.mapping(tree, key)
     for topic in lidars:
         if not isinstance(topic, str) or not re.fullmatch(_LIDAR_TOPIC, topic, re.ASCII) or topic == "scan":
-            raise checks.error(f"a name in {key}", topic, "must be a topic but scan, such as scan_rear")
+            raise checks.error(f"a name in {key}", topic, "must be a topic other than scan, such as rear")
     specs = entry_specs(SingleLidar)
     return {topic: checks.values(values, f"{key}.{topic}", specs) for topic, values in lidars.items()}
 

@@ -443,8 +443,9 @@ class MapScans:
             place = sought(state.map._replace(walls=walls), *beams, pose, covariance, reported, least)
             if place is not None and (is_lost or place.is_certain):
                 anchor[0] = place.pose
-                delay = delay._replace(anchor=anchor, stamp_ns=-1)
-                self.found_elsewhere(state, lidar, delay, stamp_ns)
+                delay = state.delays[lidar] = delay._replace(anchor=anchor, stamp_ns=-1)
+                if squared_distance(place.pose, pose, covariance + place.covariance) > _GATED:
+                    self.found_elsewhere(state, lidar, delay, stamp_ns)
                 return place, Verdict.USED, place.is_certain
         # It tells the lag, and is scored.
         if found.outcome == FITS or (found.outcome == FAR and confirmed):

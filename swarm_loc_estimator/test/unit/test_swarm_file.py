@@ -205,7 +205,7 @@ def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
         (
             "camera: {x: 0.01}",
             "lidar: {others: {a b: {x: 1}}}",
-            "a name in defaults.lidar.others is 'a b' but must be a topic but scan, such as scan_rear.",
+            "a name in defaults.lidar.others is 'a b' but must be a topic other than scan, such as rear.",
         ),
         (
             "camera: {x: 0.01}",
