@@ -28,7 +28,7 @@ PACKAGES = ("swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers")
 LONG = 700  # Maximum number of lines of a file
 # Maximum number of lines of product code. It may fall. It rises only by the size of a new sensor or robot,
 # and the commit says by how many lines.
-PRODUCT_LINES = 65_766
+PRODUCT_LINES = 65_769
 PATHS = ("path_modules", "path_containers")
 
 PRIVATE_WORDS = ("told", "anew", "likewise", "held against", "of late")

@@ -351,8 +351,9 @@ _LEFT_OUT, _LEFT_OUT_SHARE = np.array([0.1, 0.1, 0.1]), 0.2
 _NEARLY_LOST = 0.7  # Standard deviation, over that of a lost robot, from which nothing is known of a motion
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
-_ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
-"""Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
+_ORDER_WEIGHT, _ORDER_NEWS, _ORDER_SLACK = 10.0, 4.0, 0.5
+"""Log odds of this order by the misfit of a scan, whose beams err together, the most by a scan, and a difference
+of misfits that errors of a wall imitate again and again."""
 _BACKED_NS = 1_000_000_000  # How long another lidar's scan that fits speaks for the pose
 _GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
@@ -410,7 +411,9 @@ class MapScans:
         if is_open or delay.backwards > 0.0:
             reversed_beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
             other = match(walls, *reversed_beams, pose, covariance)
-            news = min(max(_ORDER_WEIGHT * (found.misfit - other.misfit), -_ORDER_NEWS), _ORDER_NEWS)
+            less = found.misfit - other.misfit
+            news = _ORDER_WEIGHT * math.copysign(max(0.0, abs(less) - _ORDER_SLACK), less)
+            news = min(max(news, -_ORDER_NEWS), _ORDER_NEWS)
             is_clear = any(one.outcome == FITS and one.fitting >= SURE_FIT for one in (found, other))
             delay = delay._replace(backwards=delay.backwards + (news if is_open and is_clear else 0.0))
             if delay.backwards > 0.0:
