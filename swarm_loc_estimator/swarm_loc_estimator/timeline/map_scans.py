@@ -352,8 +352,8 @@ _NEARLY_LOST = 0.7  # Standard deviation, over that of a lost robot, from which 
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS, _ORDER_SLACK = 10.0, 4.0, 0.5
-"""Log odds of this order by the misfit of a scan, whose beams err together, the most by a scan, and a difference
-of misfits that errors of a wall imitate again and again."""
+"""Log odds of this order by the misfit of a scan, whose beams err together, the most by a scan, and what
+of a difference of misfits errors of a wall imitate again and again."""
 _BACKED_NS = 1_000_000_000  # How long another lidar's scan that fits speaks for the pose
 _GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 DECLINE = 0.07  # How much better than others a place explains the scan by which it was found: it fits it best
