@@ -137,12 +137,17 @@ class SweepPairer(OdometryQueue):
 
     def __init__(self, lidar: LidarModel) -> None:
         super().__init__()
-        self.lidar = lidar
-        self.delay = described_delay(lidar.delay_s)
+        self._sweeps: deque[LidarSweep] = deque()
+        self.mount(lidar)
         self._track: FloatArray | None = None  # (L, 3) by odometry in the middle of the newest sweep, at lags
         self._seen: tuple[int, FloatArray] | None = None  # Node of `delay.seen`, and this pose from it
-        self._sweeps: deque[LidarSweep] = deque()
         self._newest_ns = -math.inf
+
+    def mount(self, lidar: LidarModel) -> None:
+        """Take the lidar, also for sweeps that wait for odometry, from another description."""
+        self.lidar = lidar
+        self.delay = described_delay(lidar.delay_s)
+        self._sweeps = deque(sweep._replace(lidar=lidar) for sweep in self._sweeps)
 
     def add_scan(self, scan: ScanMessage) -> None:
         """Add a scan; what cannot be used of it is counted."""
@@ -306,11 +311,11 @@ class MapperFeed:
         }
 
     def describe(self, robots: Sequence[Robot]) -> None:
-        """Take the mounts of lidars, of which no sweep has been read, from another description."""
+        """Take the mounts of lidars from another description, before any sweep has reached the mapper."""
         self._robots = robots
         for pairer, robot in zip(self._pairers, robots, strict=True):
             if isinstance(pairer, SweepPairer):
-                pairer.lidar, pairer.delay = robot.lidar, described_delay(robot.lidar.delay_s)
+                pairer.mount(robot.lidar)
 
     def add(self, robot: int, kind: MapperInput, data: bytes) -> None:
         """Process a message of a robot, by its index."""

@@ -187,6 +187,19 @@ def test_a_described_delay_puts_a_sweep_where_it_was_measured(late_ns: int) -> N
     assert stop.arrival == pytest.approx(robot.odometry(np.array([begin_ns]))[0], abs=1e-4)
 
 
+def test_a_mount_that_comes_late_counts_for_sweeps_that_wait_for_odometry() -> None:
+    robot = LidarRobot()
+    late, known = SweepPairer(replace(LIDAR, x=0.0, y=0.0, yaw=0.0)), SweepPairer(LIDAR)
+    for pairer in (late, known):
+        pairer.add_scan(robot.scan(0))
+    late.mount(LIDAR)
+    for at_ns in range(0, 2 * SWEEP_NS, ODOMETRY_NS):
+        for pairer in (late, known):
+            pairer.add_odometry(at_ns, robot.odometry(np.array([at_ns]))[0])
+    (stop,), (expected,) = late.ready(), known.ready()
+    assert stop.ends == pytest.approx(expected.ends, abs=1e-9)
+
+
 class Wanderer(LidarRobot):
     """A robot that stands, and then drives to and fro and looks around."""
 
