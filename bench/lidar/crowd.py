@@ -168,6 +168,7 @@ def _mapped(seed: int, *, sees: bool, radius: float) -> tuple[float, float]:
         for k in range(len(bodies)) if step and step % SWEEP_STEPS == 0 else ():
             begin_ns = now_ns - round(SWEEP_S * 1e9)
             fields = sweep(begin_ns, _ranges(bodies, k, step - SWEEP_STEPS, sees=sees), _FAR_M)._asdict()
+            del fields["lidar"]
             header = {"stamp": fields.pop("stamp_ns"), "frame_id": fields.pop("frame_id")}
             fields |= {"header": header, "ranges": fields["ranges"].astype(np.float32)}
             feed.add(k, MapperInput.SCAN, encode(fields, LASER_SCAN))

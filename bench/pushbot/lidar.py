@@ -182,7 +182,7 @@ class LidarDrive:
 
     def _note(self, body: LidarBody) -> None:
         """Note the pose of a sweep that has entered the graph."""
-        located = self.mapper.located(0)
+        located = self.mapper.tracks[0].located
         if located is None:
             return
         time_s = located.stamp_ns * 1e-9

@@ -171,10 +171,10 @@ def wall_distance_cm(cells: FloatArray, plan: FloorPlan) -> float:
 
 def _place(mapper: CooperativeMapper, arrival: Arrival) -> tuple[int, float]:
     """Stop of an arrival in the graph, and the turn by odometry there until now."""
-    node = mapper.newest_stop(arrival.robot)
-    if node is None:
+    track = mapper.tracks[arrival.robot]
+    if track.node is None:
         raise RuntimeError("a robot has looked around and yet is not in the graph")
-    return node, mapper.turned(arrival.robot)
+    return track.node, track.stop.turn[-1] - track.stop.begin_turn if track.stop and track.is_known else 0.0
 
 
 def _final(mapper: CooperativeMapper, places: list[tuple[int, float]]) -> FloatArray:

@@ -84,7 +84,7 @@ class _Published:
 
     def look(self, robot: int) -> None:
         """Note the pose of a robot if it is new."""
-        located = self._mapper.located(robot)
+        located = self._mapper.tracks[robot].located
         if located is not None and self._last.get(robot) is not located:
             self._last[robot] = located
             self.poses.append((robot, located, fix_covariance(self._mapper.covariance(robot))))

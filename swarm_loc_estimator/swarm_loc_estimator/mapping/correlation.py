@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 _CELL, _LEVELS = 0.05, 6  # Side of a cell [m], and number of sizes of blocks: 1 to 32 cells
@@ -27,12 +27,14 @@ _MAX_PENALTY, _DISTINCT = 4.0, 30.0
 _SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.005
 """Lattice for covariances: cells and turns to each side, and step of the turns [rad]."""
 _RIDGE = 0.1  # Standard deviation on the lattice from which a direction is unknown [m]
-_UNKNOWN = 3.0  # Standard deviation of such a direction [m]
+_UNKNOWN = 10.0  # Standard deviation of such a direction [m]
 _LEAST_VARIANCE = np.array([0.01, 0.01, 0.002]) ** 2  # [m, m, rad]
 _ON_CELLS = 0.8  # Share of its score that the best pose has at least on the cells of the search
 _STEPS = 8  # Number of Gauss-Newton steps to a place between cells
 _APART_TURN = math.radians(12.0)  # Turn from which a pose is another place
 _APART = 0.5  # Distance from which it is one [m]
+_MAX_BETWEEN, _NEIGHBOUR = 2.0, 0.5  # Greatest distance of neighbouring ends on a wall, and of any others [m]
+_ON_LINE = 0.2  # How far a third one may be from their line, over the distance of their beams
 
 
 class PointField(NamedTuple):
@@ -72,6 +74,33 @@ def thin(points: FloatArray, apart: float) -> FloatArray:
             kept[k] = True
     thinned: FloatArray = points[kept]
     return thinned
+
+
+def outline(ends: FloatArray, met: BoolArray, apart: float) -> FloatArray:
+    """Points (m, 2) along the walls that beams (n, 2) of a sweep have met, `apart` from each other [m].
+
+    Where beams graze a wall, their ends are far apart, and at the same places in the frame of the robot
+    wherever it is along the wall. So the wall between two of them is drawn where a third one lies on their
+    line, and one that has no other near it is left out.
+    """
+    # ways from each end to the next one, and whether it lies on the same wall, or near by
+    way, x, y = np.diff(ends, axis=0), *ends.T
+    length, far = np.hypot(*way.T), np.hypot(x, y)
+    beside = np.abs(x[:-1] * way[:, 1] - y[:-1] * way[:, 0]) / np.maximum(far[:-1], far[1:]).clip(1e-9)
+    bend = np.abs(way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0])
+    bend[~(met[:-2] & met[1:-1] & met[2:])] = np.inf
+    bend = np.minimum(np.append(np.inf, bend), np.append(bend, np.inf))
+    both = met[:-1] & met[1:] & (length < _MAX_BETWEEN)
+    is_wall = both & (bend < _ON_LINE * beside * length)
+    is_near = is_wall | (both & (length < _NEIGHBOUR))
+    # ends, and points on the ways along walls
+    kept = met & (np.append(is_near, False) | np.append(False, is_near))
+    count = np.append(np.where(is_wall, length / apart, 1.0).astype(int).clip(1), 1)
+    begin = np.repeat(np.arange(len(ends)), count)
+    share = (np.arange(len(begin)) - np.repeat(np.cumsum(count) - count, count)) / count[begin]
+    points = ends[begin] + share[:, None] * np.append(way, np.zeros((1, 2)), axis=0)[begin]
+    along: FloatArray = thin(points[kept[begin]], apart)
+    return along
 
 
 @cached_njit

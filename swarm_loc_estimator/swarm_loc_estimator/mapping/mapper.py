@@ -108,6 +108,7 @@ class CooperativeMapper:
         graph: The pose graph.
         visits: Visit counts of cells.
         counters: Event -> count.
+        tracks: Robot -> its state.
         background: An earlier map, drawn below the stops.
         begin_ns: Stop in the graph -> its first reading [ns].
     """
@@ -120,7 +121,7 @@ class CooperativeMapper:
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
         self.counters |= {"drives_held": 0, "scans_not_located": 0, "places_taken_back": 0}
         self.counters |= {"loops_taken_back": 0, "odometry_contradicted": 0}
-        self._tracks: dict[int, Track] = {}
+        self.tracks: dict[int, Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
         self.begin_ns: dict[int, int] = {}
@@ -132,17 +133,17 @@ class CooperativeMapper:
         Where these are infinite, a robot with a lidar is located by its scans in the map of others.
         """
         robot = self.graph.add_robot()
-        self._tracks[robot] = Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
+        self.tracks[robot] = Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
         return robot
 
     def leave(self, robot: int) -> None:
         """Remove a robot; its scans stay in the map."""
-        self._depart(robot, self._tracks[robot])
-        del self._tracks[robot]
+        self._depart(robot, self.tracks[robot])
+        del self.tracks[robot]
 
     def add_readings(self, robot: int, readings: Readings) -> None:
         """Process readings (n,) of a robot, newer than all before."""
-        track = self._tracks[robot]
+        track = self.tracks[robot]
         for run in track.motion.runs(readings):
             if run.arrives or not run.stands:
                 self._depart(robot, track)
@@ -163,7 +164,7 @@ class CooperativeMapper:
 
     def add_sweep(self, robot: int, sweep: ScanStop) -> None:
         """Process a sweep of a robot's lidar, newer than all before, if the robot has moved since."""
-        track, place = self._tracks[robot], sweep.arrival[None]
+        track, place = self.tracks[robot], sweep.arrival[None]
         step = Readings(sweep.stamp_ns[:1], place, np.full(1, UNSEEN), math.nan)
         jumps = any(run.jumps for run in track.motion.runs(step))
         found = self.sweeps.place(track.node, sweep) if jumps and track.node is not None else None
@@ -211,7 +212,7 @@ class CooperativeMapper:
             self._learn_slip(robot, stop, len(stop.turn))
         is_whole = search.add(stop, 1.0 - self.graph.slip[robot], self._map_of_others())
         track.path = 0.0
-        if is_whole and not self.graph.count and all(one.search is not None for one in self._tracks.values()):
+        if is_whole and not self.graph.count and all(one.search is not None for one in self.tracks.values()):
             track.prior_sigma = np.array([*track.prior_sigma[:2], _UNKNOWN_HEADING])
             track.search = None  # it begins the map
             return True
@@ -236,7 +237,7 @@ class CooperativeMapper:
 
     def _map_of_others(self) -> OccupancyMap:
         """The map without robots that are under test."""
-        tested = [self._under_test(robot, one.search) for robot, one in self._tracks.items() if one.search]
+        tested = [self._under_test(robot, one.search) for robot, one in self.tracks.items() if one.search]
         without = frozenset(np.concatenate(tested).tolist()) if tested else frozenset()
         graph, limit = self.graph, self.settings.max_cells
         return (
@@ -277,7 +278,7 @@ class CooperativeMapper:
 
     def pose(self, robot: int) -> FloatArray | None:
         """The pose (3,) of a robot in map at its newest reading; None before it is located."""
-        track = self._tracks[robot]
+        track = self.tracks[robot]
         if track.node is None or track.last is None or self.sweeps.floats(robot):
             return None
         if track.is_known and track.stop is not None:
@@ -288,26 +289,13 @@ class CooperativeMapper:
 
     def covariance(self, robot: int) -> FloatArray:
         """Covariance (3, 3) of the newest stop of a robot; NaN before its first scan."""
-        node = self._tracks[robot].node
+        node = self.tracks[robot].node
         return np.full((3, 3), np.nan) if node is None else self.graph.covariance(node)
 
     def goal(self, robot: int) -> Goal | None:
         """The goal of a robot; None unless it is stopped and its scan is complete."""
-        track = self._tracks[robot]
+        track = self.tracks[robot]
         return track.goal if track.is_known else None
-
-    def located(self, robot: int) -> Located | None:
-        """Where a robot was when its newest scan was complete; None before the first."""
-        return self._tracks[robot].located
-
-    def newest_stop(self, robot: int) -> int | None:
-        """Number of the newest stop of a robot in the graph."""
-        return self._tracks[robot].node
-
-    def turned(self, robot: int) -> float:
-        """Turn by odometry of a stopped robot since its newest stop began [rad]."""
-        stop = self._tracks[robot].stop
-        return 0.0 if stop is None or not self._tracks[robot].is_known else stop.turn[-1] - stop.begin_turn
 
     def occupancy(self) -> OccupancyMap:
         """The map from the current poses of the stops."""
@@ -320,7 +308,7 @@ class CooperativeMapper:
 
     def finish(self) -> None:
         """Solve the whole graph with all beams."""
-        for track in self._tracks.values():
+        for track in self.tracks.values():
             self._update_scan(track)
         self.sweeps.refine()
         align_all(self.graph)
@@ -388,7 +376,7 @@ class CooperativeMapper:
 
     def _note_light(self, lost: Visit, other: Visit, sighting: LightBetween, *, is_seen: bool) -> None:
         """Note a light that a robot that is searched sees of a located one, or the other way around."""
-        track, other_track = self._tracks.get(lost.robot), self._tracks.get(other.robot)
+        track, other_track = self.tracks.get(lost.robot), self.tracks.get(other.robot)
         tested = other_track is not None and other_track.search is not None
         if track is None or track.search is None or tested or other.node == LOST:
             return
@@ -484,7 +472,7 @@ class CooperativeMapper:
             self.sweeps.begin(node, sweep, floats=not np.isfinite(track.prior_sigma).all())
         else:
             sigma = self._motion_sigma(track.path, abs(float(motion[2])))
-            sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
+            sigma[:2] += track.path * np.array([_SWEEP_DISTANCE_NOISE, sigma[2]])
             sigma = _UNKNOWN_MOTION if jumps else sigma
             if not self.sweeps.add(begin, node, sweep, motion, sigma):
                 self.counters["scans_refused"] += 1
@@ -536,8 +524,8 @@ class CooperativeMapper:
             return
         self._look_for_home(track, node)
         x, y, theta, ratio = self.graph.states[node]
-        others = [other for key, other in self._tracks.items() if key != robot]
-        places = [self.pose(key) for key in self._tracks if key != robot]
+        others = [other for key, other in self.tracks.items() if key != robot]
+        places = [self.pose(key) for key in self.tracks if key != robot]
         hop, track.target = next_stop(
             self.occupancy(),
             np.array([x, y]),

@@ -145,8 +145,7 @@ class SweepPairer(OdometryQueue):
 
     def mount(self, lidar: LidarModel) -> None:
         """Take the lidar, also for sweeps that wait for odometry, from another description."""
-        self.lidar = lidar
-        self.delay = described_delay(lidar.delay_s)
+        self.lidar, self.delay = lidar, described_delay(lidar.delay_s)
         self._sweeps = deque(sweep._replace(lidar=lidar) for sweep in self._sweeps)
 
     def add_scan(self, scan: ScanMessage) -> None:
@@ -164,11 +163,11 @@ class SweepPairer(OdometryQueue):
         self._sweeps.append(sweep)
 
     def ready(self) -> Iterator[ScanStop]:
-        """The sweeps with known odometry, in order, at the likeliest lag."""
+        """The sweeps with known odometry, in order, at the median lag."""
         while self._sweeps:
             sweep, lag_ns = self._sweeps[0], np.round(1e9 * self.delay.lag_s).astype(np.int64)
             beams = slice(1, 1 + sweep.beam_ns.size)
-            beam_ns = sweep.beam_ns - lag_ns[self.delay.chance.argmax()]
+            beam_ns = sweep.beam_ns - lag_ns[self.delay.median]
             middle_ns = sweep.stamp_ns + sweep.duration_ns // 2
             at_ns = np.concatenate([[sweep.stamp_ns], beam_ns, middle_ns - lag_ns])
             if at_ns.max() > self.newest_ns:
@@ -185,7 +184,7 @@ class SweepPairer(OdometryQueue):
         """Learn the delay by the node of the newest sweep, of all nodes (n, 3), and its covariance (3, 3)."""
         if self._track is None:
             return
-        back = between(sweep.arrival, self._track[self.delay.chance.argmax()])
+        back = between(sweep.arrival, self._track[self.delay.median])
         if self._seen is not None:  # the graph may have moved since
             self.delay = self.delay._replace(seen=compose(poses[self._seen[0]], self._seen[1]))
         seen, self._seen = compose(poses[node], back), (node, back)

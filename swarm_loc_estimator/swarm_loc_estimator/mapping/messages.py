@@ -42,6 +42,7 @@ _RIGHT, _CHANGES_PER_S = 0.9, 0.003  # Chance that the described delay is right,
 _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does not have; error of odometry
 _BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
+_BY_CHANCE = 0.1  # Least likelihood of a lag by one scan, over the greatest: a slip may look like another lag
 _GAP_NS = 4_000_000_000  # Scans farther apart are not compared
 _WILD, _NOISE_SHARE = 400.0, 0.1
 """Squares from which odometry is wrong at any lag and tells nothing, and weight of one in its usual noise."""
@@ -268,6 +269,7 @@ class DelayBelief(NamedTuple):
     unlikely_ns: int = _LIKELY  # Stamp since when the described delay has hardly any chance
     fit_ns: int = -_LIKELY  # Stamp of the newest scan that fit where its robot was
     misses: float = 0.0  # Score of scans that contradict another lidar of the robot
+    is_sought: bool = False  # Whether its robot is at a place that was found, and that no scan has told alone
     #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
     anchor: FloatArray = _NOWHERE
 
@@ -310,6 +312,11 @@ class DelayBelief(NamedTuple):
     def is_refuted(self) -> bool:
         """Whether the described delay is wrong."""
         return self.unlikely_ns + _LASTS_NS <= self.stamp_ns
+
+    @property
+    def median(self) -> int:
+        """Number of the median lag."""
+        return int(np.searchsorted(np.cumsum(self.chance), 0.5))
 
     def sentence(self, robot: Robot, number: int = 0) -> str:
         """How old the scans of one of the lidars of a robot are, and what to describe."""
@@ -358,9 +365,8 @@ def learned_delay(
         # changes are rare, and more often to what is described
         change = 1.0 - math.exp(-1e-9 * since_ns * _CHANGES_PER_S)
         transition = (1.0 - change) * np.eye(_COUNT) + change * _delay_prior(before.lag_s)
-        chance = chance @ (
-            transition * (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
-        )
+        likely = (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
+        chance = chance @ (transition * (likely + _BY_CHANCE * np.diag(likely).max()))
         chance = chance / chance.sum() if squares.min() < _WILD else before.chance
     is_unlikely = chance[np.abs(before.lag_s) <= _NEAR_S].sum() < _REFUTED
     since_ns = min(before.unlikely_ns, stamp_ns) if is_unlikely else _LIKELY

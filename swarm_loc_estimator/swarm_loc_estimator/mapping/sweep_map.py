@@ -25,6 +25,7 @@ from swarm_loc_estimator.mapping.correlation import (
     field_of,
     gather,
     match,
+    outline,
     score_at,
     thin,
 )
@@ -183,7 +184,7 @@ class SweepMap:
         self.matched: dict[int, tuple[int, FloatArray]] = {}
         self._graph = graph
         self._chains: defaultdict[int, Chain] = defaultdict(Chain)
-        self._points, self._ways = _Points(), _GraphWays()
+        self._points, self._walls, self._ways = _Points(), _Points(), _GraphWays()
         self._unsolved = 0
         self._refined: list[LoopTie] = []  # Ties of the last solution, and for how many stops and loops
         self._refined_for = (0, 0)
@@ -234,7 +235,7 @@ class SweepMap:
         It is for robots of whose motion nothing is known.
         """
         newest = self._newest(self._chains[int(self._graph.robot[node])])
-        points = _points_of(beams_of(stop))
+        points = _outlines(beams_of(stop))[0]
         if newest is None or len(points) < _MIN_POINTS:
             return None
         found = match(newest, points, self._graph.states[node, :3], _ANYWHERE, _RIVAL, _GOOD)
@@ -244,7 +245,7 @@ class SweepMap:
         """Take back a sweep."""
         if self.drawn.pop(node, None) is None:  # the stop of a robot with a laser pointer
             return
-        self._points.counts[node] = 0
+        self._points.counts[node] = self._walls.counts[node] = 0
         self._ways.cut(node)
         self.loops = [one for one in self.loops if node not in one[:2]]
         for chain in self._chains.values():
@@ -253,13 +254,14 @@ class SweepMap:
     def _note(self, node: int, stop: ScanStop) -> FloatArray:
         """Keep a sweep; returns its points (n, 2)."""
         beams = self.drawn[node] = beams_of(stop)
-        points = _points_of(beams)
+        points, walls = _outlines(beams)
         self._points.set(node, points)
+        self._walls.set(node, walls)
         return points
 
     def locate(self, stop: ScanStop, pose: FloatArray, motion: FloatArray) -> FloatArray:
         """The pose (3,) of a sweep in the map, near one by odometry after a motion (3,)."""
-        points = _points_of(beams_of(stop))
+        points = _outlines(beams_of(stop))[0]
         nodes = np.flatnonzero(self._points.counts[: self._graph.count])
         if len(points) < _MIN_POINTS or not len(nodes):
             return pose
@@ -339,13 +341,13 @@ class SweepMap:
                 kept.append(place)
         return np.array(kept).reshape(-1, 2)
 
-    def _points_at(self, nodes: list[int]) -> FloatArray:
-        """Points (n, 2) of sweeps in map [m]."""
-        return self._points.at(np.array(nodes, dtype=np.int64), self._graph.poses[nodes])
+    def _at(self, points: _Points, nodes: list[int]) -> FloatArray:
+        """Points (n, 2) of sweeps, or along walls that they have met, in map [m]."""
+        return points.at(np.array(nodes, dtype=np.int64), self._graph.poses[nodes])
 
     def _newest(self, chain: Chain) -> PointField | None:
         """The field of the newest sweeps of a robot; None: too little was seen."""
-        others = self._points_at(chain.newest(_RECENT, _RECENT_PATH))
+        others = self._at(self._walls, chain.newest(_RECENT, _RECENT_PATH))
         return field_of(others) if len(others) >= _MIN_POINTS else None
 
     def _match_newest(
@@ -383,8 +385,8 @@ class SweepMap:
             chain.noise = np.sqrt(np.maximum((1.0 - _MEMORY) * chain.noise**2 + _MEMORY * sample, 1.0))
         if square > _CONTRADICTS:
             self.contradicted.append(node)
-            odometry = odometry * math.sqrt(0.5 * square)
-            given *= 0.5 * square
+            odometry = math.sqrt(0.5 * square) * odometry[[0, 0, 2]]  # nor is its direction to be believed
+            given = _turned(np.diag(odometry**2), 0.0)
         # the pose by both
         best = moved - given @ np.linalg.solve(given + covariance, off)
         graph.states[node, :3] = compose(before, best)
@@ -408,7 +410,7 @@ class SweepMap:
         drift = np.minimum(_DRIFT + _DRIFT_PER_M * ways, _MAX_DRIFT)
         # old sweeps that see what the newest ones see
         newest = chain.newest(_QUERY, _QUERY_PATH)
-        query = self._points_at(newest)
+        query = self._at(self._points, newest)
         query = query[:: max(1, len(query) // _QUERY_POINTS)]
         off = self._middles(old) - np.median(query, axis=0)
         away = np.hypot(off[:, 0], off[:, 1])
@@ -445,10 +447,10 @@ class SweepMap:
         if chain.path[-1] < _QUERY_PATH or chain.path[-1] - chain.searched < _EVERYWHERE_EVERY:
             return
         chain.searched = chain.path[-1]
-        known = self._points_at(others.tolist())
+        known = self._at(self._walls, others.tolist())
         if len(known) < _MIN_POINTS:
             return
-        query = self._points_at(chain.newest(len(chain.nodes), _EVERYWHERE_PATH))
+        query = self._at(self._points, chain.newest(len(chain.nodes), _EVERYWHERE_PATH))
         query = transform_points(
             inverse(graph.states[node, :3]), query[:: max(1, len(query) // _QUERY_POINTS)]
         )
@@ -516,7 +518,7 @@ class SweepMap:
         ways = self._ways.lengths(old, self._graph.count, _REFERENCE_WAY)
         ways[~is_old] = np.inf
         nearest = np.argsort(ways, kind="stable")[:_REFERENCE]
-        return field_of(self._points_at(nearest[ways[nearest] < np.inf].tolist()))
+        return field_of(self._at(self._walls, nearest[ways[nearest] < np.inf].tolist()))
 
     def _test_together(self, chain: Chain) -> None:
         """Believe ties of which several in a row say the same."""
@@ -552,14 +554,11 @@ class SweepMap:
         self._unsolved = 0
         if sum(squares) + graph.solve(3) > _CONTRADICTS * len(new):  # what all has to give way to these
             graph.states[: graph.count], graph.slip = states, slip
-            self._take_back(new)
-
-    def _take_back(self, ties: list[LoopTie]) -> None:
-        self.taken_back += len(ties)
-        self._untie(ties)
-        for one in ties:
-            self._ways.cut(one.begin, one.end)
-            self.loops.remove(one)
+            self.taken_back += len(new)
+            self._untie(new)
+            for one in new:
+                self._ways.cut(one.begin, one.end)
+                self.loops.remove(one)
 
     def _untie(self, ties: list[LoopTie]) -> None:
         rows = self._graph.constraints.ties
@@ -600,11 +599,11 @@ def beams_of(stop: ScanStop) -> DrawnSweep:
     return DrawnSweep(ends[every].astype(np.float32), sigma[every].astype(np.float32))
 
 
-def _points_of(beams: DrawnSweep) -> FloatArray:
-    """Points (n, 2) on walls that beams met, thinned [m]."""
-    near = np.isfinite(beams.sigma) & (np.hypot(beams.ends[:, 0], beams.ends[:, 1]) < _FAR)
-    points: FloatArray = thin(beams.ends[near].astype(float), _APART)
-    return points
+def _outlines(beams: DrawnSweep) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 2) on walls that beams met, thinned, and points (m, 2) along these walls [m]."""
+    ends = beams.ends.astype(float)
+    met: BoolArray = np.isfinite(beams.sigma) & (np.hypot(ends[:, 0], ends[:, 1]) < _FAR)
+    return thin(ends[met], _APART), outline(ends, met, _APART)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             self._on_mount(topic, data)
         self.feed.add(robot, kind, data)
         number = self.feed.number(robot)
-        located = self._mapper.located(number) if number is not None else None
+        located = self._mapper.tracks[number].located if number is not None else None
         if number is None or located is None or self._located.get(robot) is located:
             return
         self._located[robot] = located

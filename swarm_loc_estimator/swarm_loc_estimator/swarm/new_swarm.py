@@ -87,19 +87,12 @@ class KnownRobot:
 
 def _ring(places: Mapping[str, float], radius: float, height: float, size: float) -> tuple[Face, ...]:
     """Markers around a body, which look outwards."""
-    return tuple(
-        Face(
-            name,
-            0,
-            round(radius * math.cos(yaw), 6),
-            round(radius * math.sin(yaw), 6),
-            height,
-            round(yaw, 6),
-            size,
-        )
-        for name, degrees in places.items()
-        for yaw in [math.radians(degrees)]
-    )
+    faces = []
+    for name, degrees in places.items():
+        yaw = math.radians(degrees)
+        x, y = round(radius * math.cos(yaw), 6), round(radius * math.sin(yaw), 6)
+        faces.append(Face(name, 0, x, y, height, round(yaw, 6), size))
+    return tuple(faces)
 
 
 _DRIVEN = OdometryModel(distance_scale_sigma=0.05, turn_scale_sigma=0.05)

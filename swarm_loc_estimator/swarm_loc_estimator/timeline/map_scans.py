@@ -448,6 +448,7 @@ class MapScans:
                 anchor[0] = place.pose
                 delay = state.delays[lidar] = delay._replace(anchor=anchor, stamp_ns=-1)
                 if squared_distance(place.pose, pose, covariance + place.covariance) > _GATED:
+                    delay = delay._replace(is_sought=not place.is_certain)
                     self.found_elsewhere(state, lidar, delay, stamp_ns)
                 return place, Verdict.USED, place.is_certain
         # It tells the lag, and is scored.
@@ -478,8 +479,10 @@ class MapScans:
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # With a second solution it locates no robot alone: it was sought near the pose that may be wrong.
         fix.has_second[:], fix.second[:] = True, fix.value
-        tells = (follows and found.determined >= ALL - 1) if is_doubted else found.determined == ALL
-        tells = tells and found.fitting >= SURE_FIT and not any(one.is_doubted for one in others)
+        tells = found.determined >= (ALL - 1 if is_doubted and not delay.is_sought else ALL)
+        tells = tells and found.fitting >= SURE_FIT and (follows or not is_doubted)
+        tells = tells and not any(one.is_doubted for one in others)
+        state.delays[lidar] = delay._replace(is_sought=delay.is_sought and not tells)
         return fix, Verdict.OPEN, tells
 
     def _left_out(

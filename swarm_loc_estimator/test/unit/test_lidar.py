@@ -220,7 +220,7 @@ def test_the_mapper_finds_that_scans_are_stamped_late(late_ns: int, seed: int) -
             scan = robot.scan(at_ns - late_ns)._replace(stamp_ns=at_ns)
             feed.add(0, MapperInput.SCAN, scan_bytes(scan))
     assert [("older" in one) for one in feed.late] == [True] * (late_ns > 0)
-    located = mapper.located(0)
+    located = mapper.tracks[0].located
     assert located is not None
     assert wrapped(located.pose - robot.pose(located.stamp_ns)) == pytest.approx(0.0, abs=0.04)
 
@@ -239,7 +239,7 @@ def test_a_robot_that_does_not_stop_makes_a_map() -> None:
     off = between(truth, mapper.graph.poses)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.02
     assert np.abs(off[:, 2]).max() < math.radians(0.6)
-    located = mapper.located(0)
+    located = mapper.tracks[0].located
     assert located is not None
     assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.03)
     assert mapper.goal(0) is None
@@ -271,7 +271,7 @@ def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
         if at_ns % SWEEP_NS == 0:
             feed.add(0, MapperInput.SCAN, scan_bytes(robot.scan(at_ns)))
     assert mapper.counters["odometry_restarts"] == 1
-    located = mapper.located(0)
+    located = mapper.tracks[0].located
     assert located is not None
     assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.06)
 

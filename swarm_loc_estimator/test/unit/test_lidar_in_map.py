@@ -420,6 +420,17 @@ def test_a_robot_that_turns_to_and_fro_tells_the_delay(late_s: float) -> None:
         assert belief.is_refuted == (late_s > 0.06)
 
 
+def test_one_slip_that_looks_like_a_lag_does_not_refute_the_described_delay() -> None:
+    """A robot sets off, and moves 12 cm less than its wheels say, as if its scan were 0.3 s older."""
+    belief, covariance = described_delay(0.0), np.diag([0.01, 0.01, 0.005]) ** 2
+    stands = np.zeros((belief.lag_s.size, 3))
+    belief = learned_delay(belief, 10_000_000_000, np.zeros(3), covariance, stands)
+    drives = np.column_stack([0.8 - 0.4 * belief.lag_s, stands[:, 1:]])
+    belief = learned_delay(belief, 12_000_000_000, np.array([0.68, 0.0, 0.0]), covariance, drives)
+    assert belief.chance[0] > 0.6
+    assert belief.lag_s[belief.median] == 0.0
+
+
 @pytest.mark.parametrize("way", [straight, circling])
 def test_steady_motion_tells_nothing_and_poses_are_right_within_that(way: Way) -> None:
     now = np.array([14.8])

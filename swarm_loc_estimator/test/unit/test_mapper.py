@@ -217,7 +217,7 @@ def test_a_lost_robot_that_something_holds_has_looked_from_one_place_only(seed: 
     feed(mapper, 0, [robot.drive(0.4, 0.0)])
     arrival[2] = robot.pose[2]
     feed(mapper, 0, [robot.turn(SCAN_TURN), robot.rest(1.2)])
-    search = mapper._tracks[0].search
+    search = mapper.tracks[0].search
     assert search is not None
     assert search.poses.shape[1] == 1
     off = search.poses[:, -1] - arrival
@@ -259,7 +259,7 @@ def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     mapper, robot = CooperativeMapper(), RoomRobot((*MIDDLE, 0.3), 0.0, np.random.default_rng(22))
     robot.has_niche = False
     explore(mapper, mapper.join(np.array([*MIDDLE, 0.3]), KNOWN), robot, 2)
-    located = mapper.located(0)
+    located = mapper.tracks[0].located
     restart(robot, 2.0, 0.0)
     feed(mapper, 0, [robot.turn(0.1)])
     before, walls = mapper.graph.poses.copy(), mapper.occupancy().log_odds.copy()
@@ -267,7 +267,7 @@ def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     assert mapper.counters["scans_not_located"] > 0
     assert mapper.pose(0) is None
     assert mapper.goal(0) is None
-    assert mapper.located(0) is located
+    assert mapper.tracks[0].located is located
     assert np.array_equal(mapper.graph.poses, before)
     assert np.array_equal(mapper.occupancy().log_odds, walls)
 
@@ -277,7 +277,7 @@ def test_a_lost_robot_follows_its_odometry_where_the_map_tells_nothing() -> None
     restart(robot, 2.0, 0.0)
     arrivals = [robot.pose.copy()]
     feed(mapper, 0, look_around(robot))
-    search = mapper._tracks[0].search
+    search = mapper.tracks[0].search
     assert search is not None
     search.poses = np.array([[compose([50.0, 0.0, 0.0], arrivals[0])]])
     search.fits, search.known = np.zeros((2, 1, 1))

@@ -7,7 +7,7 @@ import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, compose
-from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match, score_at
+from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match, outline, score_at
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.scans import Scan, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
@@ -50,10 +50,12 @@ def ranges(walls: FloatArray, pose: FloatArray, angle: FloatArray) -> FloatArray
     return np.where(found < REACH, found, np.inf)
 
 
-def sweep(rng: np.random.Generator, pose: FloatArray, odometry: FloatArray, stamp_ns: int) -> ScanStop:
+def sweep(
+    rng: np.random.Generator, pose: FloatArray, odometry: FloatArray, stamp_ns: int, walls: FloatArray = RING
+) -> ScanStop:
     """A sweep of 180 beams over 270 degrees."""
     angle = np.linspace(-0.75 * math.pi, 0.75 * math.pi, 180)
-    far = ranges(RING, pose, angle) + NOISE * rng.standard_normal(len(angle))
+    far = ranges(walls, pose, angle) + NOISE * rng.standard_normal(len(angle))
     nothing = np.zeros(len(angle))
     return ScanStop.of_sweep(stamp_ns, odometry, Scan(nothing, 1.0 / far, angle), SIGMA, REACH)
 
@@ -224,16 +226,52 @@ def test_odometry_that_jumps_is_contradicted(seed: int) -> None:
     assert off(mapper, 0, truth).max() < 0.3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_beams_graze_have_no_gaps_and_nothing_stands_in_a_doorway(seed: int) -> None:
+    """A wall along the way, a post before a wall far behind it, and an open door."""
+    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 361)
+    walls = np.array(
+        [(-9.0, -1.0, 9.0, -1.0), (3.0, 0.1, 3.0, 0.4), (7.0, -1.0, 7.0, 2.0), (0.0, 2.0, 2.0, 2.0)]
+    )
+    walls = np.append(walls, [(2.9, 2.0, 9.0, 2.0)], axis=0)
+    far = ranges(walls, np.zeros(3), angle)
+    met = np.isfinite(far)
+    far = np.where(met, far, REACH) + NOISE * np.random.default_rng(seed).standard_normal(len(angle))
+    points = outline(far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1), met, 0.08)
+    lower = np.sort(points[(np.abs(points[:, 1] + 1.0) < 0.05) & (points[:, 0] < 6.8), 0])  # to the corner
+    assert np.diff(lower).max() < 0.2
+    assert lower.max() > 6.5
+    in_door = (points[:, 0] > 2.2) & (points[:, 0] < 2.7) & (np.abs(points[:, 1] - 2.0) < 0.1)
+    behind_post = (points[:, 0] > 3.2) & (points[:, 0] < 6.7) & (np.abs(points[:, 1] - 0.25) < 0.5)
+    assert not (in_door | behind_post).any()
+
+
+@pytest.mark.parametrize("turn", [-0.16, 0.08, 0.16])
+def test_along_a_corridor_odometry_counts_also_where_a_slip_has_turned_it(turn: float) -> None:
+    corridor = np.array([(0.0, 0.0, 40.0, 0.0), (0.0, 2.0, 40.0, 2.0)])
+    mapper, rng, odometry = CooperativeMapper(), np.random.default_rng(3), np.zeros(3)
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    for k in range(12):
+        if k:
+            odometry = compose(
+                odometry, [math.cos(turn), math.sin(turn), turn] if k == 6 else [1.0, 0.0, 0.0]
+            )
+        pose = np.array([10.0 + k, 1.0, 0.0])
+        mapper.add_sweep(robot, sweep(rng, pose, odometry, k * STEP_NS, corridor))
+    assert mapper.graph.poses[:12, 0] == pytest.approx(np.arange(12.0), abs=0.1)
+    assert mapper.graph.poses[:12, 1] == pytest.approx(np.zeros(12), abs=0.05)
+
+
 def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() -> None:
     mapper, truth = driven(laps(1.25), 2)
     second = mapper.join(np.zeros(3), UNKNOWN)
     path = laps(2.0)[40:90]
     drive(mapper, second, path, np.random.default_rng(5), stops=slice(3))
-    assert mapper.located(second) is None
+    assert mapper.tracks[second].located is None
     assert mapper.pose(second) is None
     cells = int(mapper.occupancy().occupied.sum())
     drive(mapper, second, path, np.random.default_rng(5), stops=slice(3, None))
-    located = mapper.located(second)
+    located = mapper.tracks[second].located
     assert located is not None
     assert located.pose[:2] == pytest.approx(between(laps(1.0)[0], path[-1])[:2], abs=0.25)
     assert off(mapper, 0, truth).max() < 0.25
@@ -250,7 +288,7 @@ def test_stops_without_a_sweep_are_taken_back_wherever_they_are_in_the_graph() -
 def test_a_full_graph_locates_robots_without_growing() -> None:
     mapper, truth = driven(laps(2.0), 3, MapperSettings(max_stops=90))
     assert mapper.graph.count == 91
-    located = mapper.located(0)
+    located = mapper.tracks[0].located
     assert located is not None
     assert located.pose[:2] == pytest.approx(truth[-1, :2], abs=0.15)
 

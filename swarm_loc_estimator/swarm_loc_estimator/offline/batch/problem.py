@@ -64,52 +64,30 @@ class Parameter(NamedTuple):
         return float(getattr(getattr(robot, self.section), self.name, np.nan))
 
 
+def _each(section: str, **sigma: float) -> tuple[Parameter, ...]:
+    """Parameters of a section by name, with their prior standard deviations."""
+    return tuple(Parameter(section, name, value) for name, value in sigma.items())
+
+
 SURVEY = (
-    Parameter("odometry", "turn_bias", 0.01),
-    Parameter("odometry", "distance_scale", 0.03),
-    Parameter("odometry", "turn_scale", 0.05),
-    Parameter("imu", "turn_bias", 0.01),
-    Parameter("imu", "turn_scale", 0.05),
-    Parameter("camera", "yaw", 0.05),
-    Parameter("sensor", "distance_scale", 0.02),
-    Parameter("sensor", "range_offset", 0.1),
+    *_each("odometry", turn_bias=0.01, distance_scale=0.03, turn_scale=0.05),
+    *_each("imu", turn_bias=0.01, turn_scale=0.05),
+    *_each("camera", yaw=0.05),
+    *_each("sensor", distance_scale=0.02, range_offset=0.1),
 )
 """What a survey corrects."""
 _MOTION = (
-    Parameter("odometry", "turn_bias", 0.02),
-    Parameter("odometry", "distance_scale", 0.1),
-    Parameter("odometry", "turn_scale", 0.1),
-    Parameter("odometry", "delay_s", 0.1),
-    Parameter("imu", "turn_bias", 0.01),
-    Parameter("imu", "turn_scale", 0.05),
+    *_each("odometry", turn_bias=0.02, distance_scale=0.1, turn_scale=0.1, delay_s=0.1),
+    *_each("imu", turn_bias=0.01, turn_scale=0.05),
 )
-_BODY = (
-    Parameter("odometry", "course_offset", 0.05),
-    Parameter("odometry", "axle_offset", 0.05),
-)
-_MOUNT = (
-    Parameter("camera", "x", 0.03),
-    Parameter("camera", "y", 0.02),
-    Parameter("sensor", "time_offset_s", 0.03),
-)
+_BODY = _each("odometry", course_offset=0.05, axle_offset=0.05)
+_MOUNT = (*_each("camera", x=0.03, y=0.02), *_each("sensor", time_offset_s=0.03))
 _POLAR = (
-    Parameter("sensor", "range_log_scale", 0.1),
-    Parameter("sensor", "range_skew", 0.05),
-    Parameter("sensor", "range_curve", 0.5),
-    Parameter("sensor", "range_offset", 0.1),
-    Parameter("sensor", "robot_range_offset", 0.05),
-    Parameter("sensor", "bearing_offset", 0.1),
-    Parameter("sensor", "bearing_scale", 0.1),
-    Parameter("sensor", "bearing_curve", 0.1),
+    *_each("sensor", range_log_scale=0.1, range_skew=0.05, range_curve=0.5, range_offset=0.1),
+    *_each("sensor", robot_range_offset=0.05, bearing_offset=0.1, bearing_scale=0.1, bearing_curve=0.1),
 )
-_POSES = (
-    Parameter("camera", "yaw", 0.1),
-    Parameter("sensor", "distance_scale", 0.05),
-)
-_RADIO = (
-    Parameter("uwb", "range_bias", 0.2),
-    Parameter("uwb", "range_scale", 0.02),
-)
+_POSES = (*_each("camera", yaw=0.1), *_each("sensor", distance_scale=0.05))
+_RADIO = _each("uwb", range_bias=0.2, range_scale=0.02)
 
 
 def calibrated_parameters(*, polar: bool, poses: bool, ranges: bool, truth: bool) -> tuple[Parameter, ...]:
