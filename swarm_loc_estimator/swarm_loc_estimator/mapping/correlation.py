@@ -84,7 +84,7 @@ def outline(ends: FloatArray, met: BoolArray, apart: float) -> FloatArray:
     line, and one that has no other near it is left out.
     """
     # ways from each end to the next one, and whether it lies on the same wall, or near by
-    way, x, y = np.diff(ends, axis=0), *ends.T
+    way, (x, y) = np.diff(ends, axis=0), ends.T
     length, far = np.hypot(*way.T), np.hypot(x, y)
     beside = np.abs(x[:-1] * way[:, 1] - y[:-1] * way[:, 0]) / np.maximum(far[:-1], far[1:]).clip(1e-9)
     bend = np.abs(way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0])

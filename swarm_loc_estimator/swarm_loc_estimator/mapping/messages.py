@@ -269,7 +269,7 @@ class DelayBelief(NamedTuple):
     unlikely_ns: int = _LIKELY  # Stamp since when the described delay has hardly any chance
     fit_ns: int = -_LIKELY  # Stamp of the newest scan that fit where its robot was
     misses: float = 0.0  # Score of scans that contradict another lidar of the robot
-    is_sought: bool = False  # Whether its robot is at a place that was found, and that no scan has told alone
+    is_sought: bool = False  # Whether its robot is where a search has put it, and no scan has confirmed that
     #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
     anchor: FloatArray = _NOWHERE
 
