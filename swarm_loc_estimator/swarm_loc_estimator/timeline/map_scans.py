@@ -388,9 +388,9 @@ class MapScans:
 
         `sweep` has its beams that may end at walls. The place of a robot that was elsewhere than predicted is
         `sought`, see `MapSearch.around`, and returned. Once a scan contradicts its pose, the robot is not
-        tracked until one scan alone tells its place, or the motion between two scans agrees with odometry. A
-        lidar that contradicts another one of its robot moves nothing, and is not used once it does so again
-        and again.
+        tracked until one scan alone tells its place, or the motion between two scans agrees with odometry, of
+        which the second tells all directions if the robot was found elsewhere. A lidar that contradicts
+        another one of its robot moves nothing, and is not used once it does so again and again.
         Fault scores of the state, which has a map, and what is known of the times of the beams are changed.
         """
         robot, stamp_ns, driven = int(one.target), int(one.stamp_ns), 0.0
@@ -509,7 +509,7 @@ class MapScans:
     def found_elsewhere(state: SwarmState, lidar: tuple[int, int], delay: DelayBelief, stamp_ns: int) -> None:
         """Forget that other lidars of a robot agreed before it was found elsewhere by this one."""
         for key in [key for key in state.delays if key[0] == lidar[0]]:
-            state.delays[key] = state.delays[key].elsewhere()
+            state.delays[key] = state.delays[key].elsewhere()._replace(is_sought=delay.is_sought)
         state.delays[lidar] = delay.elsewhere().judged(stamp_ns, fits=True)
 
     def sweep_of(self, one: Measurements) -> LidarSweep | None:
