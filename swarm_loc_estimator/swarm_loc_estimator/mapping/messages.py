@@ -42,7 +42,7 @@ _RIGHT, _CHANGES_PER_S = 0.9, 0.003  # Chance that the described delay is right,
 _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does not have; error of odometry
 _BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
-_BY_CHANCE = 0.1  # Least likelihood of a lag by one scan, over the greatest: a slip may look like another lag
+_BY_CHANCE = 0.05  # Least likelihood of a lag by one scan, over the greatest: a slip may imitate another
 _GAP_NS = 4_000_000_000  # Scans farther apart are not compared
 _WILD, _NOISE_SHARE = 400.0, 0.1
 """Squares from which odometry is wrong at any lag and tells nothing, and weight of one in its usual noise."""
